@@ -1,0 +1,1 @@
+"""Low-light dynamic Gaussian splatting in JAX."""

@@ -1,0 +1,121 @@
+"""Every setting, as frozen dataclasses, and the named presets.
+
+A setting's comment says what it is; a preset's comment says why it differs. `paper` is the text of the paper to the
+letter, `authors` what their released code does, `default` what measures best (README, "Results").
+"""
+
+import dataclasses
+import math
+from dataclasses import dataclass, field
+from typing import Literal
+
+
+@dataclass(frozen=True)
+class ModelConfig:
+    """Shape and initial state of a scene."""
+
+    sh_degree: int = 3  # bands k of Eq. 2; (k+1)^2 coefficients
+    plane_size: int = 64  # cells of a spatial axis at the coarsest scale
+    plane_scales: tuple[int, ...] = (1, 2, 4)  # factors on plane_size, concatenated; time is never scaled
+    plane_channels: int = 16
+    time_size: int | None = None  # cells of the time axis; None: half the number of training frames
+    time_range: Literal["full", "upper"] = "full"  # "upper": t in [0, 1] read as [-1, 1], half of each time plane
+    aggregation: Literal["paired_sum", "product"] = "paired_sum"  # Eq. 1, or the product of all six planes
+    hidden: int = 128  # width of g, of the heads and of OCD-Net
+    identity_start: bool = False  # heads and OCD-Net start as "no motion, a_j = 1" instead of at random
+    illumination_offset: float = 0.5  # l = max(offset + sum a_j b_j B_j, 0)
+    reflectance_init: Literal["normal", "uniform"] = "uniform"  # N(0, 1) or U(0, 1)
+    attenuation_init: Literal["normal", "uniform"] = "uniform"
+    initial_exponents: tuple[float, float] | None = None  # B1, B2 that BAFE-Net starts at; None: zero bias, 5.5
+    initial_opacity: float = 0.1
+
+
+@dataclass(frozen=True)
+class LossConfig:
+    """Weights and forms of Eqs. 10-15 and of the plane regularisers."""
+
+    l1_on: Literal["raw", "tonemapped"] = "raw"  # first term of Eq. 10 on I, or on (I + eps)^eta like the second
+    ssim: float = 1.0
+    eps: float = math.exp(-5)
+    eta_start: float = 0.95
+    eta_end: float = 0.5
+    eta_restarts: bool = False  # the decay starts anew with the fine stage
+    exposure: float = 0.01  # lambda_1, Eq. 11
+    exposure_level: float = 0.6
+    exposure_of: Literal["reflectance", "welllit"] = "reflectance"
+    exposure_window: int | None = 16  # pixels; None: the mean of the whole image
+    exposure_form: Literal["absolute", "squared"] = "absolute"
+    amplification: float = 0.05  # lambda_2, Eq. 13
+    structure: float = 1.0  # lambda_3 = lambda_4, Eq. 14
+    structure_beta: float = 0.5
+    structure_gradient: Literal["components", "magnitude"] = "components"  # forward differences, or sqrt(dx^2 + dy^2)
+    depth: float = 0.001  # lambda_5, Eq. 12
+    depth_gradient: Literal["forward", "sobel"] = "forward"
+    depth_gain: float = 1.0  # factor on D inside Eq. 12
+    illumination_tv: float = 0.0  # mean |forward difference| of L_w
+    exponent_prior: float = 0.0  # mean |B1 - initial B1|
+    plane_smoothness: float = 2e-4  # second differences along the space planes' first axis, fine stage only
+    time_smoothness: float = 1e-3  # second differences in t
+    time_l1: float = 1e-4  # mean |1 - plane| of the time planes
+
+
+@dataclass(frozen=True)
+class OptimConfig:
+    """Adam and its learning rates. `*_lr` of positions, motion field and networks decay exponentially to `*_lr_end`."""
+
+    means_lr: float = 1.6e-4  # times the scene's extent, as are the next pairs
+    means_lr_end: float = 1.6e-6
+    heads_lr: float = 1.6e-4  # mu, Q, S heads and OCD-Net
+    heads_lr_end: float = 1.6e-5
+    planes_lr: float = 1.6e-3
+    planes_lr_end: float = 1.6e-4
+    bafe_lr: float = 1.6e-3
+    bafe_lr_end: float = 1.6e-4
+    networks_scale_with_extent: bool = True  # whether heads, planes and BAFE-Net also take the factor
+    illumination_lr: float = 2.5e-3
+    illumination_rest_divisor: float = 20.0
+    reflectance_lr: float = 1e-5
+    attenuation_lr: float = 1e-5
+    opacity_lr: float = 0.05
+    scales_lr: float = 5e-3
+    quats_lr: float = 1e-3
+    decay_steps: int | None = 20_000  # length of the decays; None: the length of the stage
+    beta1: float = 0.9
+    beta2: float = 0.999
+    eps: float = 1e-15
+
+
+@dataclass(frozen=True)
+class DensityConfig:
+    """Clone, split and prune (3D Gaussian Splatting, arXiv 2308.04079, as 4DGS sets it)."""
+
+    start: int = 500  # of each stage, steps
+    stop: int = 10_000
+    interval: int = 100
+    grad_threshold: float = 2e-4  # mean norm of dL/d(mean2d), normalised device coordinates
+    clone_below: float = 0.01  # of the extent; larger Gaussians split
+    prune_opacity: float = 0.005
+    prune_above: int = 0  # prune only when more Gaussians than this exist
+    max_gaussians: int = 360_000
+
+
+@dataclass(frozen=True)
+class Config:
+    """All settings of a training run; saved as `config.json` in its folder."""
+
+    coarse_steps: int = 3000
+    fine_steps: int = 20_000
+    batch_size: int = 2  # views a step
+    seed: int = 0
+    downscale: int = 1  # reads images at 1/downscale of their full size
+    sh_warmup: int = 1000  # steps between activating one more SH band
+    checkpoint_every: int = 500  # steps
+    model: ModelConfig = field(default_factory=ModelConfig)
+    loss: LossConfig = field(default_factory=LossConfig)
+    optim: OptimConfig = field(default_factory=OptimConfig)
+    density: DensityConfig = field(default_factory=DensityConfig)
+
+    @property
+    def steps(self) -> int:
+        """Length of the whole run."""
+        return self.coarse_steps + self.fine_steps

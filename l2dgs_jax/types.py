@@ -1,0 +1,205 @@
+"""The containers that flow through the package: NamedTuples of arrays, nothing static in them."""
+
+from typing import NamedTuple
+
+from jaxtyping import Array, Bool, Float, Int
+
+
+class Camera(NamedTuple):
+    """One pinhole camera, or a batch of them, at an instant.
+
+    Axes are OpenCV's (x right, y down, z forward) and pixel centres lie at +0.5.
+
+    Attributes:
+        viewmat: world to camera, rigid.
+        K: intrinsics in pixels.
+        time: instant in [0, 1], 0 being the first frame and 1 the last.
+    """
+
+    viewmat: Float[Array, "*B 4 4"]
+    K: Float[Array, "*B 3 3"]
+    time: Float[Array, "*B"]
+
+
+class Gaussians(NamedTuple):
+    """Canonical Gaussians, raw (before activation): what the optimizer sees.
+
+    Attributes:
+        means: centres in world units.
+        quats: rotations, wxyz, any norm.
+        log_scales: logarithms of the standard deviations along the principal axes.
+        logit_opacities: opacity before the sigmoid.
+        illumination_dc: SH coefficient b_1 of Eq. 2.
+        illumination_rest: SH coefficients b_2 ... b_J of Eq. 2.
+        reflectance: r of Eq. 6.
+        attenuation: brightness attenuation features (b1, b2) of Eq. 8.
+    """
+
+    means: Float[Array, "*B N 3"]
+    quats: Float[Array, "*B N 4"]
+    log_scales: Float[Array, "*B N 3"]
+    logit_opacities: Float[Array, "*B N"]
+    illumination_dc: Float[Array, "*B N 1"]
+    illumination_rest: Float[Array, "*B N J1"]
+    reflectance: Float[Array, "*B N 3"]
+    attenuation: Float[Array, "*B N 2"]
+
+
+class MovedGaussians(NamedTuple):
+    """Gaussians at an instant, activated: what the rasterizer sees.
+
+    Attributes:
+        means: centres in world units.
+        quats: rotations, wxyz, any norm.
+        scales: standard deviations in world units.
+        opacities: in [0, 1]; exactly 0 for rows that are not alive.
+        illumination: l of Eq. 3, seen from the camera of that instant.
+        reflectance: r of Eq. 6.
+        attenuation: (b1, b2) of Eq. 8.
+    """
+
+    means: Float[Array, "*B N 3"]
+    quats: Float[Array, "*B N 4"]
+    scales: Float[Array, "*B N 3"]
+    opacities: Float[Array, "*B N"]
+    illumination: Float[Array, "*B N"]
+    reflectance: Float[Array, "*B N 3"]
+    attenuation: Float[Array, "*B N 2"]
+
+
+class Linear(NamedTuple):
+    """An affine layer y = x @ weight + bias."""
+
+    weight: Float[Array, "*B I O"]
+    bias: Float[Array, "*B O"]
+
+
+class Conv(NamedTuple):
+    """A 2D convolution, kernel in HWIO order."""
+
+    weight: Float[Array, "*B k k I O"]
+    bias: Float[Array, "*B O"]
+
+
+class GroupNorm(NamedTuple):
+    """Per-channel affine part of a group normalisation."""
+
+    scale: Float[Array, "*B C"]
+    bias: Float[Array, "*B C"]
+
+
+class HexPlane(NamedTuple):
+    """Six feature planes per scale (Eq. 1), channels last.
+
+    Attributes:
+        space: per scale, the planes XY, YZ, ZX; the axis named first is the first one.
+        time: per scale, the planes Zt, Xt, Yt, paired with `space` in that order; time is the first axis.
+    """
+
+    space: tuple[Float[Array, "*B 3 S S C"], ...]
+    time: tuple[Float[Array, "*B 3 T S C"], ...]
+
+
+class MotionHeads(NamedTuple):
+    """The aggregation g of Eq. 1 and the mu, Q and S heads: two affine layers each, the first shared width."""
+
+    aggregate: Linear
+    mean: tuple[Linear, Linear]
+    quat: tuple[Linear, Linear]
+    scale: tuple[Linear, Linear]
+
+
+class OCDNet(NamedTuple):
+    """Occlusion-disocclusion network (Eq. 4)."""
+
+    hidden: Linear
+    out: Linear
+
+
+class BAFENet(NamedTuple):
+    """Brightness attenuation feature enhancement network (between Eqs. 8 and 9)."""
+
+    conv1: Conv
+    norm1: GroupNorm
+    conv2: Conv
+    norm2: GroupNorm
+    conv3: Conv
+    norm3: GroupNorm
+    out: Conv
+
+
+class SceneParams(NamedTuple):
+    """Everything that is learned."""
+
+    gaussians: Gaussians
+    hexplane: HexPlane
+    heads: MotionHeads
+    ocd: OCDNet
+    bafe: BAFENet
+
+
+class Scene(NamedTuple):
+    """A scene of fixed capacity: rows of `params.gaussians` that are not `alive` are inert.
+
+    Attributes:
+        params: learned values.
+        alive: which Gaussians exist.
+        bounds: lowest and highest corner of the HexPlane's box, world units, not learned.
+        extent: radius of the camera path, world units: the length that position steps scale with.
+    """
+
+    params: SceneParams
+    alive: Bool[Array, "*B N"]
+    bounds: Float[Array, "*B 2 3"]
+    extent: Float[Array, "*B"]
+
+
+class RasterOutput(NamedTuple):
+    """What `rasterize` returns.
+
+    Attributes:
+        features: alpha-blended feature channels, no background.
+        alpha: accumulated opacity, 1 - final transmittance.
+        depth: sum of w z over the Gaussians of a pixel, world units, not divided by alpha.
+        means2d: projected centres in pixels.
+        radii: half-widths in pixels of the box that a Gaussian's visible ellipse fills; 0 where it is not drawn.
+        pairs: how many (Gaussian, tile) pairs the scene needs.
+        overflow: whether `pairs` exceeds the pair buffer; the images are then invalid.
+    """
+
+    features: Float[Array, "*B H W C"]
+    alpha: Float[Array, "*B H W"]
+    depth: Float[Array, "*B H W"]
+    means2d: Float[Array, "*B N 2"]
+    radii: Float[Array, "*B N"]
+    pairs: Int[Array, ""]
+    overflow: Bool[Array, ""]
+
+
+class Decomposition(NamedTuple):
+    """Images of the decomposition (Eqs. 5-9), sRGB values in [0, 1] unless said otherwise.
+
+    Attributes:
+        welllit: I_w of Eq. 7.
+        lowlight: the estimate of I_d, Eq. 9.
+        illumination: L_w of Eq. 5, clipped to [0, 1].
+        reflectance: R_w of Eq. 6, clipped to [0, 1].
+        attenuation: the exponents (B1, B2), each in (1, 10).
+    """
+
+    welllit: Float[Array, "*B H W 3"]
+    lowlight: Float[Array, "*B H W 3"]
+    illumination: Float[Array, "*B H W"]
+    reflectance: Float[Array, "*B H W 3"]
+    attenuation: Float[Array, "*B H W 2"]
+
+
+class RenderOutput(NamedTuple):
+    """A rendered view: its decomposition, its geometry, and the rasterizer's counters (see `RasterOutput`)."""
+
+    images: Decomposition
+    alpha: Float[Array, "*B H W"]
+    depth: Float[Array, "*B H W"]
+    radii: Float[Array, "*B N"]
+    pairs: Int[Array, ""]
+    overflow: Bool[Array, ""]

@@ -1,0 +1,9 @@
+"""Every test runs in float64 unless it says otherwise, with shapes and dtypes checked at run time."""
+
+import jax
+from jaxtyping import install_import_hook
+
+jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+jax.config.update("jax_numpy_rank_promotion", "raise")
+install_import_hook("l2dgs_jax", "beartype.beartype")
