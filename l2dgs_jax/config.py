@@ -28,6 +28,7 @@ class ModelConfig:
     attenuation_init: Literal["normal", "uniform"] = "uniform"
     initial_exponents: tuple[float, float] | None = None  # B1, B2 that BAFE-Net starts at; None: zero bias, 5.5
     initial_opacity: float = 0.1
+    background: float = 0.0  # value of L and R where nothing is drawn
 
 
 @dataclass(frozen=True)
@@ -63,15 +64,17 @@ class LossConfig:
 class OptimConfig:
     """Adam and its learning rates. `*_lr` of positions, motion field and networks decay exponentially to `*_lr_end`."""
 
-    means_lr: float = 1.6e-4  # times the scene's extent, as are the next pairs
+    means_lr: float = 1.6e-4
     means_lr_end: float = 1.6e-6
-    heads_lr: float = 1.6e-4  # mu, Q, S heads and OCD-Net
+    heads_lr: float = 1.6e-4  # g and the mu, Q, S heads
     heads_lr_end: float = 1.6e-5
     planes_lr: float = 1.6e-3
     planes_lr_end: float = 1.6e-4
+    ocd_lr: float = 1.6e-4
+    ocd_lr_end: float = 1.6e-5
     bafe_lr: float = 1.6e-3
     bafe_lr_end: float = 1.6e-4
-    networks_scale_with_extent: bool = True  # whether heads, planes and BAFE-Net also take the factor
+    extent_scales: tuple[str, ...] = ("means", "heads", "planes")  # groups whose rates are multiplied by the extent
     illumination_lr: float = 2.5e-3
     illumination_rest_divisor: float = 20.0
     reflectance_lr: float = 1e-5

@@ -1,0 +1,104 @@
+"""Scene, camera, instant -> images: the one function that training and every tool call."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from l2dgs_jax.config import ModelConfig
+from l2dgs_jax.decomposition import decompose
+from l2dgs_jax.deformation import deform
+from l2dgs_jax.rasterizer import rasterize
+from l2dgs_jax.scene import rung
+from l2dgs_jax.types import Camera, RenderOutput, Scene
+
+
+def render(
+    scene: Scene,
+    cameras: Camera,
+    cfg: ModelConfig,
+    width: int,
+    height: int,
+    *,
+    moving: bool,
+    sh_degree: Int[Array, ""] | int,
+    pair_capacity: int | None,
+    means2d_probe: Float[Array, "V N 2"] | None = None,
+) -> RenderOutput:
+    """Render V views, each at its own instant (Eqs. 1-9).
+
+    Gradients flow to every leaf of `scene.params` and to `means2d_probe`.
+
+    Args:
+        scene: the scene.
+        cameras: V cameras.
+        cfg: shape of the scene.
+        width: pixels.
+        height: pixels.
+        moving: whether motion field and OCD-Net are active (fine stage).
+        sh_degree: SH bands in use, 0 ... cfg.sh_degree.
+        pair_capacity: size of the rasterizer's pair buffer for all views; None only outside jit.
+        means2d_probe: zeros whose gradient is dL/d(mean2d) in pixels.
+    """
+    moved = deform(scene.params, scene.alive, scene.bounds, cameras, cfg, moving=moving, sh_degree_active=sh_degree)
+    channels = jnp.concatenate([moved.illumination[..., None], moved.reflectance, moved.attenuation], axis=-1)
+    drawn = rasterize(
+        moved.means,
+        moved.quats,
+        moved.scales,
+        moved.opacities,
+        channels,
+        cameras.viewmat,
+        cameras.K,
+        width,
+        height,
+        means2d_probe=means2d_probe,
+        pair_capacity=pair_capacity,
+    )
+    features = drawn.features
+    if cfg.background:
+        lit = jnp.arange(features.shape[-1]) < 4
+        uncovered = (1 - drawn.alpha)[..., None] * lit.astype(features.dtype)
+        features = features + cfg.background * uncovered
+    return RenderOutput(
+        images=decompose(features, scene.params.bafe),
+        alpha=drawn.alpha,
+        depth=drawn.depth,
+        radii=drawn.radii,
+        pairs=drawn.pairs,
+        overflow=drawn.overflow,
+    )
+
+
+class Renderer:
+    """Renders views of one scene outside jit, one at a time, growing the pair buffer when a view overflows it."""
+
+    def __init__(self, scene: Scene, cfg: ModelConfig, width: int, height: int, *, moving: bool, sh_degree: int):
+        self.scene, self.cfg, self.width, self.height = scene, cfg, width, height
+        self.moving, self.sh_degree = moving, sh_degree
+        self.pair_capacity = rung(4 * scene.alive.shape[0])
+
+    def __call__(self, camera: Camera) -> RenderOutput:
+        """Render one camera (no batch axis); the output has none either."""
+        cameras = jax.tree.map(lambda x: jnp.asarray(x)[None], camera)
+        while True:
+            output = _render(
+                self.scene,
+                cameras,
+                self.cfg,
+                self.width,
+                self.height,
+                moving=self.moving,
+                sh_degree=self.sh_degree,
+                pair_capacity=self.pair_capacity,
+            )
+            if not output.overflow:
+                images = jax.tree.map(lambda x: x[0], output.images)
+                return output._replace(
+                    images=images, alpha=output.alpha[0], depth=output.depth[0], radii=output.radii[0]
+                )
+            self.pair_capacity = rung(1.2 * float(output.pairs))
+
+
+_render = partial(jax.jit, static_argnames=("cfg", "width", "height", "moving", "pair_capacity"))(render)

@@ -1,0 +1,114 @@
+"""A scene's initial state, its capacity, and the names of its parameter groups."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+from scipy.spatial import cKDTree
+
+from l2dgs_jax import hexplane, networks
+from l2dgs_jax.config import ModelConfig
+from l2dgs_jax.types import BAFENet, Camera, Gaussians, HexPlane, MotionHeads, OCDNet, Scene, SceneParams
+
+SH_DC = 0.28209479177387814  # value of the first SH basis function
+LUMINANCE = np.array([0.2989, 0.587, 0.114])
+
+
+def rung(count: float, *, base: int = 1024) -> int:
+    """The smallest size >= `count` on the ladder base, 1.5 base, 1.5^2 base ... (multiples of 256).
+
+    Static sizes are taken from it, so that growing work recompiles a logarithmic number of times.
+    """
+    size = base
+    while size < count:
+        size = -(-size * 3 // 512) * 256
+    return size
+
+
+def camera_extent(cameras: Camera) -> float:
+    """1.1 times the largest distance of a camera centre from their mean, world units (as 3DGS and 4DGS)."""
+    viewmat = np.asarray(cameras.viewmat, np.float64)
+    centres = -np.einsum("fji,fj->fi", viewmat[:, :3, :3], viewmat[:, :3, 3])
+    return float(1.1 * np.linalg.norm(centres - centres.mean(0), axis=-1).max())
+
+
+def initialise(
+    key: PRNGKeyArray,
+    points: np.ndarray,
+    colors: np.ndarray | None,
+    cameras: Camera,
+    cfg: ModelConfig,
+    capacity: int,
+) -> Scene:
+    """A scene with one Gaussian a point, ready for training.
+
+    Scales are the root mean square distance to the three nearest points, illumination the luminance of the point
+    (mid-grey without colours), opacity `cfg.initial_opacity`, reflectance and attenuation random (paper, section 4).
+
+    Args:
+        key: randomness of reflectance, attenuation, planes and networks.
+        points: [P 3] world units, P <= capacity.
+        colors: [P 3] sRGB in [0, 1], or None.
+        cameras: the training cameras, [F]; their number sets the time resolution, their spread the extent.
+        cfg: shape and initial state.
+        capacity: rows to allocate; those past P are dead.
+    """
+    count = len(points)
+    keys = jax.random.split(key, 6)
+    pad = lambda x: jnp.pad(jnp.asarray(x, jnp.float32), [(0, capacity - count)] + [(0, 0)] * (np.ndim(x) - 1))
+
+    distances, _ = cKDTree(points).query(points, k=min(4, count))
+    mean_square = np.square(distances[:, 1:]).mean(-1) if count > 1 else np.ones(count)
+    grey = np.full(count, 0.5) if colors is None else np.asarray(colors) @ LUMINANCE
+    random = {"normal": jax.random.normal, "uniform": jax.random.uniform}
+    coefficients = (cfg.sh_degree + 1) ** 2
+
+    gaussians = Gaussians(
+        means=pad(points),
+        quats=pad(np.tile([1.0, 0.0, 0.0, 0.0], (count, 1))),
+        log_scales=pad(np.tile(0.5 * np.log(np.maximum(mean_square, 1e-7))[:, None], 3)),
+        logit_opacities=pad(np.full(count, np.log(cfg.initial_opacity / (1 - cfg.initial_opacity)))),
+        illumination_dc=pad((grey - cfg.illumination_offset)[:, None] / SH_DC),
+        illumination_rest=jnp.zeros((capacity, coefficients - 1)),
+        reflectance=pad(random[cfg.reflectance_init](keys[0], (count, 3))),
+        attenuation=pad(random[cfg.attenuation_init](keys[1], (count, 2))),
+    )
+    params = SceneParams(
+        gaussians=gaussians,
+        hexplane=hexplane.init(keys[2], cfg, len(cameras.time)),
+        heads=networks.init_heads(keys[3], cfg.plane_channels * len(cfg.plane_scales), cfg),
+        ocd=networks.init_ocd(keys[4], cfg),
+        bafe=networks.init_bafe(keys[5], cfg),
+    )
+    return Scene(
+        params=params,
+        alive=jnp.arange(capacity) < count,
+        bounds=jnp.asarray(np.stack([points.min(0), points.max(0)]), jnp.float32),
+        extent=jnp.asarray(camera_extent(cameras), jnp.float32),
+    )
+
+
+def groups(params: SceneParams) -> SceneParams:
+    """The learning-rate group of every leaf of `params`, by name (see `optim.schedules`)."""
+    label = lambda name, tree: jax.tree.map(lambda _: name, tree)
+    return SceneParams(
+        gaussians=Gaussians(
+            means="means",
+            quats="quats",
+            log_scales="scales",
+            logit_opacities="opacities",
+            illumination_dc="illumination",
+            illumination_rest="illumination_rest",
+            reflectance="reflectance",
+            attenuation="attenuation",
+        ),  # type: ignore[arg-type]
+        hexplane=HexPlane(*label("planes", params.hexplane)),
+        heads=MotionHeads(*label("heads", params.heads)),
+        ocd=OCDNet(*label("ocd", params.ocd)),
+        bafe=BAFENet(*label("bafe", params.bafe)),
+    )
+
+
+def pad_rows(rows: Float[Array, "N ..."], capacity: int) -> Float[Array, "M ..."]:
+    """Append zero rows up to `capacity`."""
+    return jnp.pad(rows, [(0, capacity - rows.shape[0])] + [(0, 0)] * (rows.ndim - 1))
