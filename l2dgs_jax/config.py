@@ -5,6 +5,7 @@ letter, `authors` what their released code does, `default` what measures best (R
 """
 
 import dataclasses
+import json
 import math
 from dataclasses import dataclass, field
 from typing import Literal
@@ -122,3 +123,73 @@ class Config:
     def steps(self) -> int:
         """Length of the whole run."""
         return self.coarse_steps + self.fine_steps
+
+
+def _presets() -> dict[str, Config]:
+    paper = Config(
+        model=ModelConfig(
+            illumination_offset=0.0,
+            reflectance_init="normal",
+            attenuation_init="normal",
+        ),
+        density=DensityConfig(prune_above=200_000),
+    )
+    authors = dataclasses.replace(
+        paper,
+        fine_steps=14_000,
+        model=ModelConfig(
+            time_size=150,
+            time_range="upper",
+            aggregation="product",
+            reflectance_init="normal",
+            attenuation_init="normal",
+            background=1.0,
+        ),
+        loss=LossConfig(
+            l1_on="tonemapped",
+            eps=1e-5,
+            eta_restarts=True,
+            exposure=1.0,
+            exposure_form="squared",
+            structure_gradient="magnitude",
+            depth_gradient="sobel",
+            depth_gain=5.0,
+        ),
+        optim=OptimConfig(extent_scales=("means", "heads", "planes", "ocd", "bafe")),
+    )
+    default = Config(
+        model=ModelConfig(identity_start=True, initial_exponents=(1.05, 9.0)),
+        loss=LossConfig(
+            exposure=1.0,
+            exposure_level=0.46,
+            exposure_of="welllit",
+            exposure_window=None,
+            exposure_form="squared",
+            amplification=0.0,
+            structure=0.1,
+            illumination_tv=1.0,
+            exponent_prior=0.2,
+        ),
+        optim=OptimConfig(reflectance_lr=5e-3, attenuation_lr=5e-3, extent_scales=("means",), decay_steps=None),
+    )
+    demo = dataclasses.replace(default, coarse_steps=300, fine_steps=700)
+    return {"paper": paper, "authors": authors, "default": default, "demo": demo}
+
+
+PRESETS = _presets()
+
+
+def to_dict(config: Config) -> dict:
+    """The settings as nested dictionaries of JSON values."""
+    return json.loads(json.dumps(dataclasses.asdict(config)))
+
+
+def from_dict(values: dict) -> Config:
+    """The inverse of `to_dict`.
+
+    Raises:
+        TypeError: a setting is unknown.
+    """
+    parts = {"model": ModelConfig, "loss": LossConfig, "optim": OptimConfig, "density": DensityConfig}
+    tuples = lambda items: {key: tuple(v) if isinstance(v, list) else v for key, v in items.items()}
+    return Config(**{key: parts[key](**tuples(v)) if key in parts else v for key, v in values.items()})
