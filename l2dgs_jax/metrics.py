@@ -1,0 +1,154 @@
+"""Image quality: PSNR and SSIM, their masked forms, and the scores of a held-out split."""
+
+import math
+from collections.abc import Sequence
+from functools import partial
+from typing import Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+RADIUS = 5  # of the 11x11 SSIM window
+SIGMA = 1.5  # pixels
+C1, C2 = 0.01**2, 0.03**2  # for values in [0, 1]
+
+Border = Literal["zero", "mirror"]
+
+
+class RegionScore(NamedTuple):
+    """How one region of one frame compares with the truth.
+
+    Attributes:
+        psnr: dB.
+        ssim: mean of the SSIM map (of the windows inside the image for the whole frame).
+        prediction_square: sum of p^2 over the region's values, p being the prediction and t the truth.
+        product: sum of p t.
+        truth_square: sum of t^2.
+        values: how many values the region has (pixels times channels).
+    """
+
+    psnr: float
+    ssim: float
+    prediction_square: float
+    product: float
+    truth_square: float
+    values: int
+
+
+def compare(
+    prediction: Float[Array, "H W C"], truth: Float[Array, "H W C"], dynamic: Bool[Array, "H W"] | None = None
+) -> dict[str, RegionScore]:
+    """Score one frame: "overall", and with a mask of what moves also "dynamic" and "static" where not empty."""
+    regions: dict[str, Bool[Array, "H W"] | None] = {"overall": None}
+    if dynamic is not None:
+        regions |= {name: mask for name, mask in (("dynamic", dynamic), ("static", ~dynamic)) if mask.any()}
+    scores = {}
+    for name, mask in regions.items():
+        similarity = _ssim(prediction, truth) if mask is None else _masked_ssim(prediction, truth, mask)
+        p, t = (np.asarray(image if mask is None else image[mask], np.float64) for image in (prediction, truth))
+        decibels = _psnr(prediction, truth, mask)
+        scores[name] = RegionScore(
+            float(decibels), float(similarity), (p * p).sum(), (p * t).sum(), (t * t).sum(), p.size
+        )
+    return scores
+
+
+def gain(scores: Sequence[RegionScore]) -> float:
+    """The one factor g = <p, t> / <p, p> that brings predictions p closest to truths t over all scores; 1 if p = 0."""
+    square = sum(score.prediction_square for score in scores)
+    return sum(score.product for score in scores) / square if square else 1.0
+
+
+def summarise(frames: Sequence[dict[str, RegionScore]]) -> dict[str, dict[str, float]]:
+    """Means over frames of what `compare` returned, per region.
+
+    Returns:
+        For each region that occurs, the means of "psnr" and "ssim", and "psnr_gain": the mean PSNR in dB after all
+        predictions were multiplied by the `gain` of the whole split (whole frames), unclipped.
+    """
+    g = gain([frame["overall"] for frame in frames])
+    summary = {}
+    for region in ("overall", "dynamic", "static"):
+        scores = [frame[region] for frame in frames if region in frame]
+        if not scores:
+            continue
+        errors = [max(g * g * s.prediction_square - 2 * g * s.product + s.truth_square, 0.0) / s.values for s in scores]
+        summary[region] = {
+            "psnr": float(np.mean([s.psnr for s in scores])),
+            "ssim": float(np.mean([s.ssim for s in scores])),
+            "psnr_gain": float(np.mean([-10 * math.log10(e) if e else math.inf for e in errors])),
+        }
+    return summary
+
+
+def ssim_map(
+    a: Float[Array, "*B H W C"], b: Float[Array, "*B H W C"], border: Border = "zero"
+) -> Float[Array, "*B H W C"]:
+    """Structural similarity around each pixel, in an 11x11 Gaussian window of sigma 1.5, per channel.
+
+    Source: Wang et al. 2004 with the population covariance. Gradients flow to both images.
+
+    Args:
+        a: image with values in [0, 1].
+        b: image with values in [0, 1].
+        border: what windows see beyond the image: "zero" (3D Gaussian Splatting's loss) or the image mirrored
+            about its edge (scikit-image).
+    """
+    # Only the sum of the two variances enters SSIM, so four blurred images do instead of five.
+    moments = jnp.stack([a, b, a * a + b * b, a * b])
+    mean_a, mean_b, square, product = _blur(moments, border)
+    means = mean_a * mean_b
+    mean_squares = mean_a * mean_a + mean_b * mean_b
+    return ((2 * means + C1) * (2 * (product - means) + C2)) / ((mean_squares + C1) * (square - mean_squares + C2))
+
+
+def ssim(a: Float[Array, "*B H W C"], b: Float[Array, "*B H W C"]) -> Float[Array, "*B"]:
+    """Mean SSIM over the windows that lie inside the image, as scikit-image; over all if the image has none."""
+    similarity = ssim_map(a, b, "mirror")
+    height, width = a.shape[-3:-1]
+    if min(height, width) > 2 * RADIUS:
+        similarity = similarity[..., RADIUS:-RADIUS, RADIUS:-RADIUS, :]
+    return similarity.mean((-3, -2, -1))
+
+
+def masked_ssim(
+    a: Float[Array, "*B H W C"], b: Float[Array, "*B H W C"], mask: Bool[Array, "*B H W"]
+) -> Float[Array, "*B"]:
+    """Mean of the SSIM map over a mask, as NSFF (arXiv 2011.13084); NaN where the mask is empty."""
+    return _masked_mean(ssim_map(a, b, "mirror"), mask)
+
+
+def psnr(
+    a: Float[Array, "*B H W C"], b: Float[Array, "*B H W C"], mask: Bool[Array, "*B H W"] | None = None
+) -> Float[Array, "*B"]:
+    """Peak signal to noise ratio in dB for values in [0, 1], of the pixels in `mask` (mPSNR, arXiv 2210.13445).
+
+    Infinite for equal images, NaN where the mask is empty.
+    """
+    error = (a - b) ** 2
+    return -10 * jnp.log10(error.mean((-3, -2, -1)) if mask is None else _masked_mean(error, mask))
+
+
+def _masked_mean(values: Float[Array, "*B H W C"], mask: Bool[Array, "*B H W"]) -> Float[Array, "*B"]:
+    weights = mask.astype(values.dtype)
+    return (values.mean(-1) * weights).sum((-2, -1)) / weights.sum((-2, -1))
+
+
+def _blur(images: Float[Array, "*B H W C"], border: Border) -> Float[Array, "*B H W C"]:
+    *_, height, width, _ = images.shape
+    rows, columns = (jnp.asarray(_blur_matrix(n, border), images.dtype) for n in (height, width))
+    precise = partial(jnp.einsum, precision=jax.lax.Precision.HIGHEST)
+    return precise("jw,...iwc->...ijc", columns, precise("ih,...hwc->...iwc", rows, images))
+
+
+def _blur_matrix(size: int, border: Border) -> np.ndarray:
+    offsets = np.arange(-RADIUS, RADIUS + 1)
+    window = np.exp(-0.5 * (offsets / SIGMA) ** 2)
+    window /= window.sum()
+    beyond = np.pad(np.eye(size), ((RADIUS, RADIUS), (0, 0)), "constant" if border == "zero" else "symmetric")
+    return sum(weight * beyond[k : k + size] for k, weight in enumerate(window))
+
+
+_ssim, _masked_ssim, _psnr = jax.jit(ssim), jax.jit(masked_ssim), jax.jit(psnr)
