@@ -63,7 +63,9 @@ def load(path: Path, config: Config, like: TrainState) -> Checkpoint:
     names = [jax.tree_util.keystr(key) for key, _ in leaves]
     misfit = next((n for n, (_, leaf) in zip(names, leaves, strict=True) if _rank(arrays, n) != np.ndim(leaf)), None)
     if misfit:
-        raise UserError(f"{path}: the array {misfit} is missing or has another shape; expected a checkpoint of this run")
+        raise UserError(
+            f"{path}: the array {misfit} is missing or has another shape; expected a checkpoint of this run"
+        )
     state = jax.tree_util.tree_unflatten(treedef, [jnp.asarray(arrays[name]) for name in names])
     return Checkpoint(state, header["pair_capacity"])
 

@@ -36,8 +36,8 @@ class Densified(NamedTuple):
     """
 
     gaussians: Gaussians
-    alive: Bool[Array, "N"]
-    changed: Bool[Array, "N"]
+    alive: Bool[Array, " N"]
+    changed: Bool[Array, " N"]
     wanted: Int[Array, ""]
     missing: Int[Array, ""]
 
@@ -58,7 +58,7 @@ def accumulate(
 
 def densify(
     gaussians: Gaussians,
-    alive: Bool[Array, "N"],
+    alive: Bool[Array, " N"],
     stats: GrowthStats,
     extent: Float[Array, ""],
     key: PRNGKeyArray,
@@ -82,7 +82,7 @@ def densify(
     wanted = jnp.minimum(restless.sum(), budget)
 
     by_need = jnp.argsort(jnp.where(restless, -restlessness, jnp.inf))
-    rank = jnp.zeros(capacity, jnp.int32).at[by_need].set(jnp.arange(capacity, dtype=jnp.int32))
+    rank = jnp.argsort(by_need)
     chosen = restless & (rank < jnp.minimum(wanted, free))
     free_rows = jnp.nonzero(~alive_kept, size=capacity, fill_value=capacity)[0]
     target = jnp.where(chosen, free_rows[rank], capacity)  # row `capacity` does not exist: the write is dropped
@@ -100,7 +100,7 @@ def densify(
     )
 
 
-def _sample(gaussians: Gaussians, split: Bool[Array, "N"], key: PRNGKeyArray) -> Gaussians:
+def _sample(gaussians: Gaussians, split: Bool[Array, " N"], key: PRNGKeyArray) -> Gaussians:
     """Rows of `split` replaced by a smaller Gaussian centred at a sample of themselves; the others unchanged."""
     scales = jnp.exp(gaussians.log_scales)
     local = scales * jax.random.normal(key, scales.shape, scales.dtype)

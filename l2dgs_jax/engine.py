@@ -207,7 +207,7 @@ def run(split: Split, config: Config, state: TrainState, pair_capacity: int | No
         yield Progress(state, report, pair_capacity)
 
 
-def load_batch(split: Split, indices: Int[np.ndarray, "V"]) -> Batch:
+def load_batch(split: Split, indices: Int[np.ndarray, " V"]) -> Batch:
     """The views of `indices`."""
     return Batch(Camera(*(x[indices] for x in split.cameras)), split.images[indices])
 
@@ -231,9 +231,7 @@ def densify(state: TrainState, config: Config) -> TrainState:
 def _densify(state: TrainState, config: Config) -> tuple[TrainState, Int[Array, ""], Int[Array, ""]]:
     scene = state.scene
     key = jax.random.fold_in(jax.random.key(config.seed), state.step)
-    result = density.densify(
-        scene.params.gaussians, scene.alive, state.stats, scene.extent, key, config.density
-    )
+    result = density.densify(scene.params.gaussians, scene.alive, state.stats, scene.extent, key, config.density)
     forget = lambda rows: jnp.where(result.changed.reshape(-1, *[1] * (rows.ndim - 1)), 0, rows)
     moments = lambda tree: tree._replace(gaussians=jax.tree.map(forget, tree.gaussians))
     grown = TrainState(

@@ -38,8 +38,8 @@ class Transformation(NamedTuple):
 
 
 def learning_rate(schedule: Schedule, count: Int[Array, "*S"]) -> Float[Array, "*S"]:
-    """start (end / start)^(count / steps), with count / steps at most 1; 0 where start is 0."""
-    progress = jnp.minimum(count / schedule.steps, 1.0).astype(schedule.start.dtype)
+    """The rate start (end / start)^(count / steps), with count / steps at most 1; 0 where start is 0."""
+    progress = jnp.minimum(count.astype(schedule.start.dtype) / schedule.steps, 1.0)
     start = jnp.where(schedule.start > 0, schedule.start, 1.0)
     return jnp.where(schedule.start > 0, start * (schedule.end / start) ** progress, 0.0)
 
