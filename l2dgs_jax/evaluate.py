@@ -1,0 +1,151 @@
+"""`python -m l2dgs_jax.evaluate RUN`: how well the views of a run match the input and, where known, the truth."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import tyro
+
+from l2dgs_jax import cli, metrics, runs
+from l2dgs_jax.errors import UserError
+from l2dgs_jax.metrics import RegionScore
+from l2dgs_jax.render import choose_split, views
+from l2dgs_jax.runs import Run
+from l2dgs_jax.visualize import replacing
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Score every view of a split.
+
+    Attributes:
+        run: folder of the run.
+        split: which views.
+        json: file to write the scores to.
+        stage: the last checkpoint, or the one at the end of the coarse stage.
+    """
+
+    run: tyro.conf.Positional[Path]
+    split: Literal["test", "train"] = "test"
+    json: Path | None = None
+    stage: Literal["final", "coarse"] = "final"
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Evaluate as the command line says."""
+    options = cli.parse(Evaluate, arguments, "evaluate")
+    if options.json and (options.json.is_dir() or not options.json.parent.is_dir()):
+        raise UserError(f"--json {options.json}: cannot be written; expected a file in an existing folder")
+    result = evaluate(runs.open_run(options.run, options.stage), options.split)
+    print(table(result))
+    if options.json:
+        with replacing(options.json) as temporary:
+            temporary.write_text(json.dumps(result, indent=2) + "\n")
+
+
+def evaluate(run: Run, split_name: str = "test") -> dict:
+    """Render every view of a split and compare it with the input and, where the scene has it, with the well-lit truth.
+
+    PSNR (dB) and SSIM are means over the frames. A region's PSNR is that of its own pixels, its SSIM the mean of the
+    whole frame's SSIM map over them (as NSFF, arXiv 2011.13084); a frame counts where it shows the region.
+
+    Returns:
+        What can be written as JSON:
+
+        * "split", "stage", "step", "gaussians", "frames": what was scored;
+        * "lowlight": "psnr" and "ssim" of the estimate of the dark input against that input, and with masks
+          "lowlight_regions", the same for "dynamic" and "static", and "mask_area", the dynamic part of all pixels;
+        * with truth "welllit": for "overall" and, with masks, "dynamic" and "static" the "psnr" and "ssim" of the
+          well-lit image as rendered, and "psnr_gain" and "ssim_gain" after it was multiplied by "gain" and clipped to
+          [0, 1]: the one factor for all frames that brings them closest to the truth in the least-squares sense;
+        * with truth "dark_frame_gain": "gain", "psnr_gain" and "ssim_gain" of the dark input times its own best factor,
+          which is what knowing the exposure alone would score.
+
+    Raises:
+        UserError: the split has no views.
+    """
+    split = choose_split(run, split_name)
+    count = len(split.names)
+    masks = split.masks if split.masks is not None else [None] * count
+    lowlight, welllit = [], []
+    for index, output in enumerate(views(run, split)):
+        inputs = np.asarray(split.images[index], np.float32)
+        lowlight.append(metrics.compare(np.asarray(output.images.lowlight, np.float32), inputs, masks[index]))
+        if split.welllit is not None:
+            welllit.append(output.images.welllit.astype(np.float16))  # as compact as the data set's own images
+
+    scores = _means(lowlight)
+    result: dict = {
+        "split": split_name,
+        "stage": "fine" if run.moving else "coarse",
+        "step": int(run.state.step),
+        "gaussians": int(run.state.scene.alive.sum()),
+        "frames": count,
+        "lowlight": scores.pop("overall"),
+    }
+    if split.masks is not None:
+        result |= {"lowlight_regions": scores, "mask_area": float(split.masks.mean())}
+    if split.welllit is not None:
+        plain, gained, gain = _with_gain(welllit, split.welllit, masks)
+        result |= {"welllit": {region: plain[region] | gained[region] for region in plain}, "gain": gain}
+        _, gained, gain = _with_gain(split.images, split.welllit, [None] * count)
+        result["dark_frame_gain"] = {"gain": gain} | gained["overall"]
+    return result
+
+
+def table(result: dict) -> str:
+    """The scores that `evaluate` returns, as aligned text."""
+    rows = [("low light", result["lowlight"])]
+    rows += [(f"  {region}", scores) for region, scores in result.get("lowlight_regions", {}).items()]
+    for region, scores in result.get("welllit", {}).items():
+        rows.append(("well-lit" if region == "overall" else f"  {region}", scores))
+    if "dark_frame_gain" in result:
+        rows.append(("dark frame x gain", result["dark_frame_gain"]))
+    lines = [f"{result['frames']} {result['split']} views, {result['stage']} stage, step {result['step']}"]
+    lines.append(f"{'':18}{'PSNR':>8}{'SSIM':>8}{'PSNR, gain':>13}{'SSIM, gain':>13}")
+    for name, scores in rows:
+        formats = (("psnr", "8.2f"), ("ssim", "8.3f"), ("psnr_gain", "13.2f"), ("ssim_gain", "13.3f"))
+        cells = (format(scores[key], form) if key in scores else " " * int(form.split(".")[0]) for key, form in formats)
+        lines.append(f"{name:18}{''.join(cells)}".rstrip())
+    if "gain" in result:
+        lines.append(f"gain {result['gain']:.3f}, of the dark frame {result['dark_frame_gain']['gain']:.3f}")
+    if "mask_area" in result:
+        lines.append(f"dynamic region: {100 * result['mask_area']:.1f} % of the pixels")
+    return "\n".join(lines)
+
+
+def _with_gain(
+    predictions: Sequence[np.ndarray], truths: Sequence[np.ndarray], masks: Sequence[np.ndarray | None]
+) -> tuple[dict, dict, float]:
+    """Scores per region without and with the one best gain, and that gain."""
+
+    def scores(gain: float) -> list[dict[str, RegionScore]]:
+        return [
+            metrics.compare(np.clip(np.float32(gain) * p.astype(np.float32), 0, 1), t.astype(np.float32), mask)
+            for p, t, mask in zip(predictions, truths, masks, strict=True)
+        ]
+
+    plain = scores(1.0)
+    gain = metrics.gain([frame["overall"] for frame in plain])
+    gained = _means(scores(gain))
+    renamed = {region: {f"{key}_gain": value for key, value in means.items()} for region, means in gained.items()}
+    return _means(plain), renamed, gain
+
+
+def _means(frames: Sequence[dict[str, RegionScore]]) -> dict[str, dict[str, float]]:
+    """Per region, the means over the frames that show it."""
+    regions = [region for region in ("overall", "dynamic", "static") if any(region in frame for frame in frames)]
+    return {
+        region: {
+            key: float(np.mean([getattr(frame[region], key) for frame in frames if region in frame]))
+            for key in ("psnr", "ssim")
+        }
+        for region in regions
+    }
+
+
+if __name__ == "__main__":
+    cli.main(main)
