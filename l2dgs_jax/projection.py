@@ -1,0 +1,99 @@
+"""Projection of 3D Gaussians onto the image plane: elliptical weighted averaging (EWA)."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+NEAR = 0.01  # world units; Gaussians whose centre is nearer are not drawn
+BLUR = 0.3  # pixels^2 added to the projected covariance, so that no Gaussian falls between pixels
+FIELD_MARGIN = 0.3  # of half the field of view: how far outside the image the Jacobian still follows the centre
+
+
+class Projected(NamedTuple):
+    """Gaussians on the image plane.
+
+    Attributes:
+        means2d: centres in pixels.
+        covariances2d: (xx, xy, yy) in pixels^2, blur included.
+        conics: (xx, xy, yy) of the inverse of the covariance, pixels^-2.
+        depths: distance along the camera's z axis, world units.
+        visible: whether the centre lies beyond the near plane; values of other rows are finite and meaningless.
+    """
+
+    means2d: Float[Array, "*B N 2"]
+    covariances2d: Float[Array, "*B N 3"]
+    conics: Float[Array, "*B N 3"]
+    depths: Float[Array, "*B N"]
+    visible: Bool[Array, "*B N"]
+
+
+def rotations(quats: Float[Array, "*B N 4"]) -> Float[Array, "N 3 3"]:
+    """Rotation matrices of quaternions (wxyz) of any norm; a zero quaternion is the identity and has no gradient."""
+    squared = jnp.sum(quats**2, axis=-1, keepdims=True)
+    proper = squared > 1e-24
+    unit = jnp.where(proper, quats / jnp.sqrt(jnp.where(proper, squared, 1)), 0)
+    w, x, y, z = unit[:, 0], unit[:, 1], unit[:, 2], unit[:, 3]
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def project(
+    means: Float[Array, "N 3"],
+    quats: Float[Array, "N 4"],
+    scales: Float[Array, "N 3"],
+    viewmat: Float[Array, "4 4"],
+    K: Float[Array, "3 3"],
+    width: int,
+    height: int,
+) -> Projected:
+    """Project Gaussians by a pinhole camera, to first order around their centres (EWA; 3DGS, arXiv 2308.04079).
+
+    Gradients flow to means, quats, scales, viewmat and K, and are zero for Gaussians nearer than the near plane.
+
+    Args:
+        means: centres, world units.
+        quats: rotations, wxyz, any norm.
+        scales: standard deviations along the principal axes, world units.
+        viewmat: world to camera, OpenCV axes.
+        K: intrinsics, pixels; skew moves centres but does not shear the ellipses.
+        width: pixels.
+        height: pixels.
+    """
+    camera_means = means @ viewmat[:3, :3].T + viewmat[None, :3, 3]
+    # A NaN depth counts as visible, so that it shows in the image instead of vanishing.
+    visible = ~(camera_means[:, 2] <= NEAR)
+    x, y, z = jnp.where(visible[:, None], camera_means, jnp.array([0, 0, 1], means.dtype)[None]).T
+    normalised = jnp.stack([x / z, y / z], axis=-1)
+    means2d = normalised @ K[:2, :2].T + K[None, :2, 2]
+
+    focal, centre = jnp.diagonal(K)[:2], K[:2, 2]
+    size = jnp.array([width, height], means.dtype)
+    margin = FIELD_MARGIN * 0.5 * size / focal
+    lowest, highest = -(centre / focal + margin), (size - centre) / focal + margin
+    tx, ty = jnp.clip(normalised, lowest[None], highest[None]).T
+    zero = jnp.zeros_like(z)
+    jacobian = jnp.stack(
+        [
+            jnp.stack([focal[0] / z, zero, -focal[0] * tx / z], axis=-1),
+            jnp.stack([zero, focal[1] / z, -focal[1] * ty / z], axis=-1),
+        ],
+        axis=-2,
+    )
+    half = jacobian @ viewmat[None, :3, :3] @ (rotations(quats) * scales[:, None, :])
+    u, v = half[:, 0], half[:, 1]
+    xx, xy, yy = jnp.sum(u * u, axis=-1) + BLUR, jnp.sum(u * v, axis=-1), jnp.sum(v * v, axis=-1) + BLUR
+    # Cauchy-Schwarz bounds the unblurred determinant by zero; the blur keeps this sum positive after rounding too.
+    determinant = (xx - BLUR) * (yy - BLUR) - xy * xy
+    determinant = jnp.maximum(determinant, 0) + BLUR * (xx + yy - BLUR)
+    return Projected(
+        means2d=means2d,
+        covariances2d=jnp.stack([xx, xy, yy], axis=-1),
+        conics=jnp.stack([yy, -xy, xx], axis=-1) / determinant[:, None],
+        depths=z,
+        visible=visible,
+    )
