@@ -124,7 +124,7 @@ def train_step(
     state: TrainState, batch: Batch, config: Config, *, moving: bool, pair_capacity: int
 ) -> tuple[TrainState, StepReport]:
     """One Adam step on one batch; a step that cannot be trusted leaves the state as it was and says so."""
-    batch = batch._replace(images=batch.images.astype(state.stats.seen.dtype))
+    batch = jax.tree.map(lambda x: x.astype(state.stats.seen.dtype), batch)
 
     def value_and_grad(params: SceneParams) -> tuple:
         probe = jnp.zeros((*batch.cameras.time.shape, state.scene.alive.shape[0], 2), batch.images.dtype)

@@ -81,7 +81,7 @@ class Renderer:
 
     def __call__(self, camera: Camera) -> RenderOutput:
         """Render one camera (no batch axis); the output has none either."""
-        cameras = jax.tree.map(lambda x: jnp.asarray(x)[None], camera)
+        cameras = jax.tree.map(lambda x: jnp.asarray(x, float)[None], camera)
         while True:
             output = _render(
                 self.scene,

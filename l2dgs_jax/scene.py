@@ -55,7 +55,7 @@ def initialise(
     """
     count = len(points)
     keys = jax.random.split(key, 6)
-    pad = lambda x: jnp.pad(jnp.asarray(x, jnp.float32), [(0, capacity - count)] + [(0, 0)] * (np.ndim(x) - 1))
+    pad = lambda x: jnp.pad(jnp.asarray(x, float), [(0, capacity - count)] + [(0, 0)] * (np.ndim(x) - 1))
 
     distances, _ = cKDTree(points).query(points, k=min(4, count))
     mean_square = np.square(distances[:, 1:]).mean(-1) if count > 1 else np.ones(count)
@@ -83,8 +83,8 @@ def initialise(
     return Scene(
         params=params,
         alive=jnp.arange(capacity) < count,
-        bounds=jnp.asarray(np.stack([points.min(0), points.max(0)]), jnp.float32),
-        extent=jnp.asarray(camera_extent(cameras), jnp.float32),
+        bounds=jnp.asarray(np.stack([points.min(0), points.max(0)]), float),
+        extent=jnp.asarray(camera_extent(cameras), float),
     )
 
 
