@@ -27,7 +27,8 @@ class ModelConfig:
     illumination_offset: float = 0.5  # l = max(offset + sum a_j b_j B_j, 0)
     reflectance_init: Literal["normal", "uniform"] = "uniform"  # N(0, 1) or U(0, 1)
     attenuation_init: Literal["normal", "uniform"] = "uniform"
-    initial_exponents: tuple[float, float] | None = None  # B1, B2 that BAFE-Net starts at; None: zero bias, 5.5
+    # B1, B2 that BAFE-Net starts at; None: zero bias, 5.5. B1 "auto": what the frames' darkness implies (tone.py)
+    initial_exponents: tuple[float | Literal["auto"], float] | None = None
     initial_opacity: float = 0.1
     background: float = 0.0  # value of L and R where nothing is drawn
 
@@ -158,7 +159,7 @@ def _presets() -> dict[str, Config]:
         optim=OptimConfig(extent_scales=("means", "heads", "planes", "ocd", "bafe")),
     )
     default = Config(
-        model=ModelConfig(identity_start=True, initial_exponents=(1.05, 9.0)),
+        model=ModelConfig(identity_start=True, initial_exponents=("auto", 9.0)),
         loss=LossConfig(
             exposure=1.0,
             exposure_level=0.46,

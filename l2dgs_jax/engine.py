@@ -1,5 +1,6 @@
 """The training step and the coarse-to-fine loop. No input or output: callers consume the steps that `run` yields."""
 
+import dataclasses
 import warnings
 from collections.abc import Iterator
 from functools import partial
@@ -17,6 +18,7 @@ from l2dgs_jax.data.dataset import Dataset, Split
 from l2dgs_jax.density import GrowthStats
 from l2dgs_jax.rendering import render
 from l2dgs_jax.scene import groups, initialise, pad_rows, rung
+from l2dgs_jax.tone import darkening_exponent
 from l2dgs_jax.types import Camera, Scene, SceneParams
 
 with warnings.catch_warnings():
@@ -157,8 +159,19 @@ def adam(params: SceneParams, rates: dict[str, optim.Schedule], config: Config) 
     return optim.adam(groups(params), rates, config.optim.beta1, config.optim.beta2, config.optim.eps)
 
 
+def resolve(config: Config, split: Split) -> Config:
+    """The settings with what they leave to the data filled in from the training frames."""
+    exponents = config.model.initial_exponents
+    if exponents is None or exponents[0] != "auto":
+        return config
+    b1 = darkening_exponent(float(split.images.mean(dtype=np.float64)), config.loss.exposure_level)
+    return dataclasses.replace(
+        config, model=dataclasses.replace(config.model, initial_exponents=(round(b1, 3), exponents[1]))
+    )
+
+
 def initial_state(dataset: Dataset, config: Config) -> TrainState:
-    """The state before the first step; the same seed and data give the same state."""
+    """The state before the first step of a `resolve`d config; the same seed and data give the same state."""
     capacity = rung(min(1.5 * len(dataset.points), max(config.density.max_gaussians, len(dataset.points))))
     scene = initialise(
         jax.random.key(config.seed), dataset.points, dataset.colors, dataset.train.cameras, config.model, capacity

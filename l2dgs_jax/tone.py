@@ -1,0 +1,35 @@
+"""What underexposure does to an sRGB image: the prior for B1, the exponent between R_w and the dark input."""
+
+import numpy as np
+from jaxtyping import Float
+
+
+def srgb_to_linear(value: Float[np.ndarray, "*S"]) -> Float[np.ndarray, "*S"]:
+    """Inverse of the sRGB transfer function (IEC 61966-2-1)."""
+    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
+
+
+def linear_to_srgb(value: Float[np.ndarray, "*S"]) -> Float[np.ndarray, "*S"]:
+    """The sRGB transfer function (IEC 61966-2-1), value >= 0."""
+    return np.where(value <= 0.0031308, value * 12.92, 1.055 * value ** (1 / 2.4) - 0.055)
+
+
+def darkening_exponent(dark_level: float, lit_level: float) -> float:
+    """The power law that best describes an underexposed sRGB image of mean `dark_level`.
+
+    Light scaled by k before the sRGB curve is close to a gain times a power of the well-exposed value after it, with
+    an exponent above 1 that grows with darkness. k follows from the two levels; the power is fitted by least squares
+    in log-log coordinates over the mid-tones, sRGB 0.1 to 0.9.
+
+    Args:
+        dark_level: mean sRGB value of the dark frames, in (0, 1).
+        lit_level: mean sRGB value that a well-lit image is expected to have.
+
+    Returns:
+        An exponent in [1.01, 2].
+    """
+    dark, lit = srgb_to_linear(np.array([dark_level, lit_level]))
+    well = np.linspace(0.1, 0.9, 81)
+    low = linear_to_srgb(min(dark / lit, 1.0) * srgb_to_linear(well))
+    slope = np.polyfit(np.log(well), np.log(low), 1)[0]
+    return float(np.clip(slope, 1.01, 2.0))

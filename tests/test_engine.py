@@ -1,0 +1,220 @@
+"""The training step and loop on a tiny scene: gradients, resuming, growing, refusing."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from l2dgs_jax import checkpoint, engine
+from l2dgs_jax.checkpoint import Checkpoint
+from l2dgs_jax.config import PRESETS, DensityConfig, from_dict, to_dict
+from l2dgs_jax.data.dataset import Dataset, Split
+from l2dgs_jax.errors import UserError
+from l2dgs_jax.rendering import Renderer
+from l2dgs_jax.types import Camera
+
+WIDTH, HEIGHT, FRAMES = 16, 12, 6
+
+
+def tiny(preset="default", **changes):
+    base = PRESETS[preset]
+    exponents = base.model.initial_exponents and (1.5, 9.0)
+    small = dataclasses.replace(base.model, initial_exponents=exponents, plane_size=4, plane_scales=(1, 2), plane_channels=2, hidden=8, sh_degree=1)
+    density = DensityConfig(start=1, stop=100, interval=3, grad_threshold=1e-9, max_gaussians=60)
+    changes = {"coarse_steps": 4, "fine_steps": 4, "sh_warmup": 3, "density": density, "model": small} | changes
+    return dataclasses.replace(base, **changes)
+
+
+def make_dataset(seed=0):
+    rng = np.random.default_rng(seed)
+    points = rng.uniform([-1, -0.7, 2], [1, 0.7, 3], (25, 3)).astype(np.float32)
+    viewmat = np.tile(np.eye(4, dtype=np.float32), (FRAMES, 1, 1))
+    viewmat[:, 0, 3] = np.linspace(-0.2, 0.2, FRAMES)
+    intrinsics = np.tile(np.array([[14, 0, 8], [0, 14, 6], [0, 0, 1]], np.float32), (FRAMES, 1, 1))
+    cameras = Camera(viewmat, intrinsics, np.linspace(0, 1, FRAMES, dtype=np.float32))
+    images = rng.uniform(0, 0.2, (FRAMES, HEIGHT, WIDTH, 3)).astype(np.float16)
+    split = Split(tuple(map(str, range(FRAMES))), cameras, images, None, None)
+    return Dataset("tiny", WIDTH, HEIGHT, split, split, points, None)
+
+
+@pytest.fixture(scope="module")
+def dataset():
+    return make_dataset()
+
+
+def finish(dataset, config, state=None, pair_capacity=None):
+    last = None
+    for last in engine.run(dataset.train, config, state or engine.initial_state(dataset, config), pair_capacity):
+        pass
+    return last
+
+
+@pytest.fixture(scope="module")
+def finished(dataset):
+    return finish(dataset, tiny())
+
+
+def assert_equal_states(a, b):
+    for (path, x), y in zip(jax.tree_util.tree_leaves_with_path(a), jax.tree.leaves(b), strict=True):
+        np.testing.assert_array_equal(x, y, err_msg=jax.tree_util.keystr(path))
+
+
+def objective_of(dataset, config, moving):
+    """The whole objective as a function of the parameters, away from the special values that training starts at."""
+    state = engine.initial_state(dataset, config)
+    jitter = lambda x, key: x + 0.03 * jax.random.normal(jax.random.key(key), x.shape, x.dtype)
+    leaves, treedef = jax.tree.flatten(state.scene.params)
+    params = treedef.unflatten([jitter(x, key) for key, x in enumerate(leaves)])
+    batch = engine.load_batch(dataset.train, np.array([1, 4]))
+    batch = jax.tree.map(lambda x: jnp.asarray(x, float), batch)
+    probe = jnp.zeros((2, state.scene.alive.shape[0], 2))
+
+    @jax.jit
+    def value(params, probe):
+        return engine.objective(params, probe, state, batch, config, moving, 4096)[0]
+
+    return value, params, probe
+
+
+@pytest.mark.parametrize("preset", ["paper", "authors", "default"])
+@pytest.mark.parametrize("moving", [False, True])
+def test_gradient_of_the_whole_objective_by_directional_differences(dataset, preset, moving):
+    value, params, probe = objective_of(dataset, tiny(preset), moving)
+    gradient = jax.grad(value, argnums=(0, 1))(params, probe)
+    parts = {
+        "gaussians": lambda p: p.gaussians,
+        "hexplane": lambda p: p.hexplane,
+        "heads": lambda p: p.heads,
+        "ocd": lambda p: p.ocd,
+        "bafe": lambda p: p.bafe,
+    }
+    for index, (name, part) in enumerate(parts.items()):
+        mask = jax.tree.map(lambda _: False, params)._replace(**{name: jax.tree.map(lambda _: True, part(params))})
+        keys = iter(jax.random.split(jax.random.key(index), 100))
+        direction = jax.tree.map(
+            lambda x, use: jax.random.normal(next(keys), x.shape) if use else jnp.zeros_like(x), params, mask
+        )
+        slope = sum(jnp.vdot(g, d) for g, d in zip(*map(jax.tree.leaves, (gradient[0], direction)), strict=True))
+        differences = []
+        for step in (1e-6, 5e-7):
+            ahead, behind = (
+                value(jax.tree.map(lambda p, d, s=sign * step: p + s * d, params, direction), probe) for sign in (1, -1)
+            )
+            differences.append((ahead - behind) / (2 * step))
+        scale = max(abs(float(slope)), 1e-4)
+        assert min(abs(float(slope - d)) for d in differences) < 2e-3 * scale, (name, slope, differences)
+        if name in ("gaussians", "bafe") or moving:
+            assert slope != 0, name
+
+
+def test_probe_gradient_is_the_gradient_of_moving_on_screen(dataset):
+    value, params, probe = objective_of(dataset, tiny(), False)
+    slope = jax.grad(value, argnums=1)(params, probe)
+    direction = jax.random.normal(jax.random.key(0), probe.shape)
+    ahead, behind = (value(params, probe + sign * 1e-6 * direction) for sign in (1, -1))
+    np.testing.assert_allclose((ahead - behind) / 2e-6, jnp.vdot(slope, direction), rtol=2e-3)
+
+
+def test_training_lowers_the_loss_and_grows(dataset):
+    config = tiny(coarse_steps=40, fine_steps=0)
+    reports = [(float(p.report.loss), int(p.state.scene.alive.sum())) for p in engine.run(
+        dataset.train, config, engine.initial_state(dataset, config))]
+    losses, counts = zip(*reports, strict=True)
+    assert np.mean(losses[-5:]) < 0.9 * np.mean(losses[:5])
+    assert counts[-1] == 60 > counts[0] == 25
+
+
+def test_a_resumed_run_equals_the_uninterrupted_one(dataset, finished, tmp_path):
+    config = tiny()
+    for stop in (3, 4, 6):
+        for progress in engine.run(dataset.train, config, engine.initial_state(dataset, config)):
+            if int(progress.state.step) == stop:
+                checkpoint.save(tmp_path / "c.npz", Checkpoint(progress.state, progress.pair_capacity), config)
+                break
+        state, pair_capacity = checkpoint.load(tmp_path / "c.npz", config, engine.initial_state(dataset, config))
+        assert int(state.step) == stop
+        assert_equal_states(finish(dataset, config, state, pair_capacity).state, finished.state)
+
+
+def test_a_small_pair_buffer_grows_and_changes_nothing(dataset, finished):
+    small = finish(dataset, tiny(), pair_capacity=8)
+    assert small.pair_capacity > 8
+    for x, y in zip(*map(jax.tree.leaves, (small.state.scene, finished.state.scene)), strict=True):
+        np.testing.assert_allclose(x, y, rtol=1e-6, atol=1e-9)
+
+
+def test_dead_rows_are_inert(dataset):
+    config = tiny(density=DensityConfig(start=1000))
+    state = engine.initial_state(dataset, config)
+    wide = finish(dataset, config, engine.with_capacity(state, 2000)).state
+    plain = finish(dataset, config, engine.initial_state(dataset, config)).state
+    rows = plain.scene.alive.shape[0]
+    for x, y in zip(*map(jax.tree.leaves, (plain.scene.params.gaussians, wide.scene.params.gaussians)), strict=True):
+        np.testing.assert_allclose(x, y[:rows], rtol=1e-6, atol=1e-9)
+        np.testing.assert_array_equal(y[rows:], 0)
+
+
+def test_the_fine_stage_starts_where_the_coarse_one_ended(dataset):
+    config = tiny()
+    state = engine.initial_state(dataset, config)
+    camera = Camera(*(x[2] for x in dataset.train.cameras))
+    coarse, fine = (
+        Renderer(state.scene, config.model, WIDTH, HEIGHT, moving=moving, sh_degree=1)(camera) for moving in (0, 1)
+    )
+    np.testing.assert_allclose(coarse.images.lowlight, fine.images.lowlight, atol=1e-12)
+
+
+def test_a_step_with_a_nan_changes_nothing_and_stops_the_run(dataset):
+    config = tiny()
+    images = dataset.train.images.copy()
+    images[:, 0, 0] = np.nan
+    state = engine.initial_state(dataset, config)
+    before = jax.tree.map(np.array, state)
+    batch = engine.load_batch(dataclasses.replace(dataset.train, images=images), np.array([0, 1]))
+    after, report = engine.train_step(state, batch, config, moving=False, pair_capacity=4096)
+    assert not report.finite
+    assert_equal_states(after, before)
+    with pytest.raises(engine.DivergedError, match="step 0"):
+        finish(dataclasses.replace(dataset, train=dataclasses.replace(dataset.train, images=images)), config)
+
+
+def test_vmap_over_scenes_equals_a_loop(dataset):
+    config = tiny()
+    datasets = [dataset, make_dataset(1)]
+    states = [engine.initial_state(d, config) for d in datasets]
+    batches = [engine.load_batch(d.train, np.array([0, 3])) for d in datasets]
+    stack = lambda trees: jax.tree.map(lambda *x: jnp.stack([jnp.asarray(v) for v in x]), *trees)
+    step = lambda state, batch: engine.train_step(state, batch, config, moving=True, pair_capacity=4096)
+    together, reports = jax.vmap(step)(stack(states), stack(batches))
+    for index, (state, batch) in enumerate(zip(states, batches, strict=True)):
+        alone, report = step(state, batch)
+        np.testing.assert_allclose(reports.loss[index], report.loss, rtol=1e-9)
+        for x, y in zip(*map(jax.tree.leaves, (together, alone)), strict=True):
+            np.testing.assert_allclose(x[index], y, rtol=1e-6, atol=1e-8)
+
+
+@pytest.mark.parametrize("damage", ["truncated", "text", "missing", "settings"])
+def test_a_bad_checkpoint_is_one_clear_sentence(dataset, tmp_path, damage):
+    config = tiny()
+    path = tmp_path / "checkpoint.npz"
+    checkpoint.save(path, Checkpoint(engine.initial_state(dataset, config), 64), config)
+    if damage == "truncated":
+        path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    elif damage == "text":
+        path.write_text("not a checkpoint")
+    elif damage == "missing":
+        path.unlink()
+    else:
+        config = dataclasses.replace(config, batch_size=1)
+    with pytest.raises(UserError, match="checkpoint.npz: .*expected") as caught:
+        checkpoint.load(path, config, engine.initial_state(dataset, config))
+    assert "\n" not in str(caught.value)
+    if damage == "settings":
+        assert "batch_size was 2, is 1" in str(caught.value)
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_settings_survive_json(preset):
+    assert from_dict(to_dict(PRESETS[preset])) == PRESETS[preset]
