@@ -4,10 +4,11 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import tyro
+from jaxtyping import Bool, Float, Shaped
 
 from l2dgs_jax import cli, metrics, runs
 from l2dgs_jax.errors import UserError
@@ -68,14 +69,11 @@ def evaluate(run: Run, split_name: str = "test") -> dict:
         UserError: the split has no views.
     """
     split = choose_split(run, split_name)
-    count = len(split.names)
-    masks = split.masks if split.masks is not None else [None] * count
     lowlight, welllit = [], []
     for index, output in enumerate(views(run, split)):
-        inputs = np.asarray(split.images[index], np.float32)
-        lowlight.append(metrics.compare(np.asarray(output.images.lowlight, np.float32), inputs, masks[index]))
+        lowlight.append(_compare(output.images.lowlight, split.images, split.masks, index))
         if split.welllit is not None:
-            welllit.append(output.images.welllit.astype(np.float16))  # as compact as the data set's own images
+            welllit.append(np.asarray(output.images.welllit, np.float16))  # as compact as the data set's own images
 
     scores = _means(lowlight)
     result: dict = {
@@ -83,15 +81,15 @@ def evaluate(run: Run, split_name: str = "test") -> dict:
         "stage": "fine" if run.moving else "coarse",
         "step": int(run.state.step),
         "gaussians": int(run.state.scene.alive.sum()),
-        "frames": count,
+        "frames": len(split.names),
         "lowlight": scores.pop("overall"),
     }
     if split.masks is not None:
         result |= {"lowlight_regions": scores, "mask_area": float(split.masks.mean())}
     if split.welllit is not None:
-        plain, gained, gain = _with_gain(welllit, split.welllit, masks)
+        plain, gained, gain = _with_gain(np.stack(welllit), split.welllit, split.masks)
         result |= {"welllit": {region: plain[region] | gained[region] for region in plain}, "gain": gain}
-        _, gained, gain = _with_gain(split.images, split.welllit, [None] * count)
+        _, gained, gain = _with_gain(split.images, split.welllit, None)
         result["dark_frame_gain"] = {"gain": gain} | gained["overall"]
     return result
 
@@ -118,33 +116,33 @@ def table(result: dict) -> str:
 
 
 def _with_gain(
-    predictions: Sequence[np.ndarray], truths: Sequence[np.ndarray], masks: Sequence[np.ndarray | None]
+    predictions: Float[np.ndarray, "F H W 3"],
+    truths: Float[np.ndarray, "F H W 3"],
+    masks: Bool[np.ndarray, "F H W"] | None,
 ) -> tuple[dict, dict, float]:
     """Scores per region without and with the one best gain, and that gain."""
-
-    def scores(gain: float) -> list[dict[str, RegionScore]]:
-        return [
-            metrics.compare(np.clip(np.float32(gain) * p.astype(np.float32), 0, 1), t.astype(np.float32), mask)
-            for p, t, mask in zip(predictions, truths, masks, strict=True)
-        ]
-
-    plain = scores(1.0)
+    plain = [_compare(p, truths, masks, i) for i, p in enumerate(predictions)]
     gain = metrics.gain([frame["overall"] for frame in plain])
-    gained = _means(scores(gain))
-    renamed = {region: {f"{key}_gain": value for key, value in means.items()} for region, means in gained.items()}
+    gained = [_compare(gain * p.astype(np.float32), truths, masks, i) for i, p in enumerate(predictions)]
+    renamed = {region: {f"{k}_gain": v for k, v in means.items()} for region, means in _means(gained).items()}
     return _means(plain), renamed, gain
 
 
+def _compare(
+    prediction: Shaped[Any, "H W 3"],
+    truths: Float[np.ndarray, "F H W 3"],
+    masks: Bool[np.ndarray, "F H W"] | None,
+    index: int,
+) -> dict[str, RegionScore]:
+    """Score a prediction, clipped to [0, 1], of the frame `index`."""
+    clipped = np.clip(np.asarray(prediction, np.float32), 0, 1)
+    return metrics.compare(clipped, truths[index].astype(np.float32), None if masks is None else masks[index])
+
+
 def _means(frames: Sequence[dict[str, RegionScore]]) -> dict[str, dict[str, float]]:
-    """Per region, the means over the frames that show it."""
-    regions = [region for region in ("overall", "dynamic", "static") if any(region in frame for frame in frames)]
-    return {
-        region: {
-            key: float(np.mean([getattr(frame[region], key) for frame in frames if region in frame]))
-            for key in ("psnr", "ssim")
-        }
-        for region in regions
-    }
+    """Per region, the mean PSNR and SSIM over the frames that show it."""
+    summary = metrics.summarise(frames)
+    return {region: {key: means[key] for key in ("psnr", "ssim")} for region, means in summary.items()}
 
 
 if __name__ == "__main__":

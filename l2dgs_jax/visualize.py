@@ -4,6 +4,7 @@ import contextlib
 import os
 from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import Any
 
 import cv2
 import jax
@@ -76,7 +77,7 @@ def contact_sheet(run: Run, rows: int = 4) -> UInt8[np.ndarray, "H W 3"]:
 
 
 def video(run: Run, path: Path) -> None:
-    """A short flight through space and time: on the left the estimate of the dark input, on the right the well-lit scene.
+    """A short flight through space and time: the estimate of the dark input on the left, well-lit on the right.
 
     Raises:
         UserError: the file cannot be written.
@@ -127,7 +128,8 @@ def space_time_path(cameras: Camera, frames: int) -> Camera:
     viewmat[:, :3, :3] = turned
     viewmat[:, :3, 3] = -np.einsum("fij,fj->fi", turned, moved)
     K = np.einsum("fv,vij->fij", weights, intrinsics)
-    return Camera(*(x.astype(cameras.viewmat.dtype) for x in (viewmat, K, instants)))
+    path: list[Any] = [x.astype(cameras.viewmat.dtype) for x in (viewmat, K, instants)]
+    return Camera(*path)
 
 
 def view(cameras: Camera, index: int) -> Camera:
@@ -210,7 +212,7 @@ def replacing(path: Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
-def _nearby(at: Float[np.ndarray, "A"], times: Float[np.ndarray, "F"], bandwidth: float) -> Float[np.ndarray, "A F"]:
+def _nearby(at: Float[np.ndarray, " A"], times: Float[np.ndarray, " F"], bandwidth: float) -> Float[np.ndarray, "A F"]:
     """Gaussian weights of the views around each instant; rows sum to 1."""
     exponent = -0.5 * ((at[:, None] - times[None]) / bandwidth) ** 2
     weights = np.exp(exponent - exponent.max(-1, keepdims=True))
