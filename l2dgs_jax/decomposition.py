@@ -41,13 +41,13 @@ def clip_unit(x: Float[Array, "*S"]) -> Float[Array, "*S"]:
 
 
 def power(base: Float[Array, "*S"], exponent: Float[Array, "*E"]) -> Float[Array, "*S"]:
-    """Return base ** exponent for bases in [0, 1] and exponents >= 1 (Eq. 9), both carrying gradients.
+    """Return base ** exponent for bases >= 0 and exponents > 0, both carrying gradients (Eqs. 9, 10).
 
     A base of 0, or too small to have a finite reciprocal, gives 0 with zero gradients.
 
     Args:
         base: bases.
-        exponent: exponents, of the same rank as `base` and broadcastable to it.
+        exponent: exponents: one for all, or of the rank of `base` and broadcastable to it.
     """
     positive = base >= jnp.finfo(base.dtype).tiny
     log_base = jnp.log(jnp.where(positive, base, 1))

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float, Int
 
 from l2dgs_jax import metrics
 from l2dgs_jax.config import LossConfig
+from l2dgs_jax.decomposition import power
 from l2dgs_jax.types import RenderOutput
 
 Scalar = Float[Array, ""]
@@ -76,7 +77,7 @@ def eta(step: Int[Array, ""] | int, steps: int, cfg: LossConfig) -> Scalar:
 
 def tonemap(image: Float[Array, "*S"], eta: Scalar | float, eps: float) -> Float[Array, "*S"]:
     """(I + eps)^eta of Eq. 10, which lifts dark values; `image` >= 0 carries gradients."""
-    return (image + eps) ** jnp.asarray(eta, image.dtype)
+    return power(image + eps, jnp.asarray(eta, image.dtype))
 
 
 def photometric_l1(

@@ -15,6 +15,8 @@ SIGMA = 1.5  # pixels
 C1, C2 = 0.01**2, 0.03**2  # for values in [0, 1]
 
 Border = Literal["zero", "mirror"]
+Image = Float[Array, "H W C"] | Float[np.ndarray, "H W C"]
+Mask = Bool[Array, "H W"] | Bool[np.ndarray, "H W"]
 
 
 class RegionScore(NamedTuple):
@@ -37,22 +39,32 @@ class RegionScore(NamedTuple):
     values: int
 
 
-def compare(
-    prediction: Float[Array, "H W C"], truth: Float[Array, "H W C"], dynamic: Bool[Array, "H W"] | None = None
-) -> dict[str, RegionScore]:
-    """Score one frame: "overall", and with a mask of what moves also "dynamic" and "static" where not empty."""
-    regions: dict[str, Bool[Array, "H W"] | None] = {"overall": None}
+def compare(prediction: Image, truth: Image, dynamic: Mask | None = None) -> dict[str, RegionScore]:
+    """Score one frame, values in [0, 1].
+
+    Args:
+        prediction: rendered image.
+        truth: what it should be.
+        dynamic: which pixels show something that moves.
+
+    Returns:
+        The score of "overall" and, given a mask, of "dynamic" and "static", those of them that have any pixel.
+    """
+    prediction, truth = np.asarray(prediction), np.asarray(truth, prediction.dtype)
+    everywhere = np.ones(prediction.shape[:2], bool)
+    scores = {"overall": _score(prediction, truth, everywhere, _ssim(prediction, truth))}
     if dynamic is not None:
-        regions |= {name: mask for name, mask in (("dynamic", dynamic), ("static", ~dynamic)) if mask.any()}
-    scores = {}
-    for name, mask in regions.items():
-        similarity = _ssim(prediction, truth) if mask is None else _masked_ssim(prediction, truth, mask)
-        p, t = (np.asarray(image if mask is None else image[mask], np.float64) for image in (prediction, truth))
-        decibels = _psnr(prediction, truth, mask)
-        scores[name] = RegionScore(
-            float(decibels), float(similarity), (p * p).sum(), (p * t).sum(), (t * t).sum(), p.size
-        )
+        dynamic = np.asarray(dynamic)
+        for region, mask in (("dynamic", dynamic), ("static", ~dynamic)):
+            if mask.any():
+                scores[region] = _score(prediction, truth, mask, _masked_ssim(prediction, truth, mask))
     return scores
+
+
+def _score(prediction: np.ndarray, truth: np.ndarray, mask: np.ndarray, similarity: Float[Array, ""]) -> RegionScore:
+    p, t = prediction[mask].astype(np.float64), truth[mask].astype(np.float64)
+    decibels = _psnr(prediction, truth, mask)
+    return RegionScore(float(decibels), float(similarity), np.sum(p * p), np.sum(p * t), np.sum(t * t), p.size)
 
 
 def gain(scores: Sequence[RegionScore]) -> float:
@@ -96,9 +108,10 @@ def ssim_map(
         border: what windows see beyond the image: "zero" (3D Gaussian Splatting's loss) or the image mirrored
             about its edge (scikit-image).
     """
-    # Only the sum of the two variances enters SSIM, so four blurred images do instead of five.
-    moments = jnp.stack([a, b, a * a + b * b, a * b])
-    mean_a, mean_b, square, product = _blur(moments, border)
+    # Only the sum of the two variances enters SSIM: four blurred images do instead of five. The mean of b stands apart
+    # so that a gradient in `a` alone sends only three of them back.
+    mean_a, square, product = _blur(jnp.stack([a, a * a + b * b, a * b]), border)
+    mean_b = _blur(b, border)
     means = mean_a * mean_b
     mean_squares = mean_a * mean_a + mean_b * mean_b
     return ((2 * means + C1) * (2 * (product - means) + C2)) / ((mean_squares + C1) * (square - mean_squares + C2))

@@ -1,0 +1,194 @@
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.test_util import check_grads
+from skimage.metrics import peak_signal_noise_ratio, structural_similarity
+
+from l2dgs_jax import metrics
+
+REFERENCE = {
+    "gaussian_weights": True,
+    "sigma": 1.5,
+    "use_sample_covariance": False,
+    "channel_axis": -1,
+    "data_range": 1,
+}
+ssim, psnr, masked_ssim = jax.jit(metrics.ssim), jax.jit(metrics.psnr), jax.jit(metrics.masked_ssim)
+ssim_map = jax.jit(metrics.ssim_map, static_argnames="border")
+ssim_and_gradient = jax.jit(jax.value_and_grad(metrics.ssim))
+
+
+def pair(seed, *shape):
+    rng = np.random.default_rng(seed)
+    a = rng.uniform(size=shape)
+    return a, np.clip(a + rng.normal(0, 0.1, shape), 0, 1)
+
+
+def frames(seed=0, count=3, height=14, width=17):
+    rng = np.random.default_rng(seed)
+    for i in range(count):
+        prediction, truth = pair(10 * seed + i, height, width, 3)
+        yield prediction, truth, rng.uniform(size=(height, width)) > 0.6
+
+
+@pytest.mark.parametrize("shape", [(11, 11, 3), (23, 17, 3), (12, 31, 1)], ids=str)
+def test_ssim_is_scikit_images(shape):
+    a, b = pair(0, *shape)
+    mean, full = structural_similarity(a, b, full=True, **REFERENCE)
+    np.testing.assert_allclose(ssim(jnp.asarray(a), jnp.asarray(b)), mean, atol=1e-12)
+    np.testing.assert_allclose(ssim_map(jnp.asarray(a), jnp.asarray(b), "mirror"), full, atol=1e-12)
+
+
+def test_ssim_of_float32_images_keeps_five_digits():
+    a, b = pair(1, 40, 50, 3)
+    single = ssim(jnp.asarray(a, jnp.float32), jnp.asarray(b, jnp.float32))
+    np.testing.assert_allclose(single, structural_similarity(a, b, **REFERENCE), atol=1e-5)
+
+
+def test_the_border_matters_only_near_the_border():
+    a, b = (jnp.asarray(x) for x in pair(2, 16, 18, 3))
+    zero, mirror = ssim_map(a, b, "zero"), ssim_map(a, b, "mirror")
+    np.testing.assert_allclose(zero[5:-5, 5:-5], mirror[5:-5, 5:-5], atol=1e-13)
+    assert jnp.abs(zero - mirror)[0].max() > 1e-3
+
+
+@pytest.mark.parametrize("border", ["zero", "mirror"])
+def test_ssim_of_equal_images_is_one_and_stationary(border):
+    a = jnp.asarray(pair(3, 12, 13, 3)[0])
+    np.testing.assert_allclose(ssim_map(a, a, border), 1, atol=1e-12)
+    np.testing.assert_allclose(jax.jit(jax.grad(lambda b: ssim_map(a, b, border).mean()))(a), 0, atol=1e-10)
+
+
+def test_ssim_is_symmetric_and_lower_for_worse_images():
+    a, b = (jnp.asarray(x) for x in pair(4, 16, 16, 3))
+    np.testing.assert_allclose(ssim(a, b), ssim(b, a), atol=1e-13)
+    assert ssim(a, b) > ssim(a, b[::-1])
+
+
+@pytest.mark.parametrize("border", ["zero", "mirror"])
+def test_ssim_gradients(border):
+    a, b = (jnp.asarray(x) for x in pair(5, 6, 7, 2))
+    check_grads(jax.jit(lambda a, b: ssim_map(a, b, border).mean()), (a, b), 1, ("fwd", "rev"), 1e-6, 1e-6, eps=1e-5)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 20), (4, 10), (10, 11)], ids=str)
+def test_images_smaller_than_the_window_have_a_finite_ssim(size):
+    a, b = (jnp.asarray(x) for x in pair(6, *size, 3))
+    value, grad = ssim_and_gradient(a, b)
+    assert -1 <= value < 1
+    assert jnp.isfinite(grad).all()
+    np.testing.assert_allclose(ssim(a, a), 1, atol=1e-12)
+
+
+@pytest.mark.parametrize("level", [0.0, 1.0])
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_flat_images_have_finite_ssim(level, dtype):
+    flat = jnp.full((12, 12, 3), level, dtype)
+    for other in (flat, 1 - flat):
+        value, grad = ssim_and_gradient(flat, other)
+        assert jnp.isfinite(value)
+        assert jnp.isfinite(grad).all()
+
+
+def test_batches_are_scored_image_by_image():
+    a, b = (jnp.asarray(x) for x in pair(7, 2, 3, 12, 13, 3))
+    mask = jnp.asarray(np.random.default_rng(0).uniform(size=(2, 3, 12, 13)) > 0.5)
+    for together, one in (
+        (ssim(a, b), ssim(a[1, 2], b[1, 2])),
+        (psnr(a, b), psnr(a[1, 2], b[1, 2])),
+        (psnr(a, b, mask), psnr(a[1, 2], b[1, 2], mask[1, 2])),
+        (masked_ssim(a, b, mask), masked_ssim(a[1, 2], b[1, 2], mask[1, 2])),
+    ):
+        assert together.shape == (2, 3)
+        np.testing.assert_allclose(together[1, 2], one, rtol=1e-12)
+
+
+def test_psnr_is_scikit_images():
+    a, b = pair(8, 9, 10, 3)
+    expected = peak_signal_noise_ratio(a, b, data_range=1)
+    np.testing.assert_allclose(psnr(jnp.asarray(a), jnp.asarray(b)), expected, rtol=1e-12)
+    everywhere = jnp.ones((9, 10), bool)
+    np.testing.assert_allclose(psnr(jnp.asarray(a), jnp.asarray(b), everywhere), expected, rtol=1e-12)
+    assert psnr(jnp.asarray(a), jnp.asarray(a)) == jnp.inf
+
+
+def test_masked_scores_see_the_mask_alone():
+    a, b = pair(9, 12, 13, 3)
+    mask = np.zeros((12, 13), bool)
+    mask[3:7, 2:9] = True
+    expected = peak_signal_noise_ratio(a[3:7, 2:9], b[3:7, 2:9], data_range=1)
+    np.testing.assert_allclose(psnr(jnp.asarray(a), jnp.asarray(b), jnp.asarray(mask)), expected, rtol=1e-12)
+    _, full = structural_similarity(a, b, full=True, **REFERENCE)
+    actual = masked_ssim(jnp.asarray(a), jnp.asarray(b), jnp.asarray(mask))
+    np.testing.assert_allclose(actual, full[3:7, 2:9].mean(), atol=1e-12)
+
+
+def test_empty_masks_have_no_score():
+    a = jnp.asarray(pair(10, 12, 12, 3)[0])
+    empty = jnp.zeros((12, 12), bool)
+    assert jnp.isnan(psnr(a, a, empty))
+    assert jnp.isnan(masked_ssim(a, a, empty))
+
+
+def test_summary_is_the_mean_over_frames_with_one_gain():
+    split = list(frames())
+    summary = metrics.summarise([metrics.compare(*frame) for frame in split])
+    predictions, truths = (np.concatenate([frame[i].ravel() for frame in split]) for i in (0, 1))
+    g = np.linalg.lstsq(predictions[:, None], truths, rcond=None)[0].item()
+    for region, choose in (
+        ("overall", np.ones_like),
+        ("dynamic", lambda mask: mask),
+        ("static", np.logical_not),
+    ):
+        for name, factor in (("psnr", 1.0), ("psnr_gain", g)):
+            psnrs = [
+                peak_signal_noise_ratio(t[choose(mask)], factor * p[choose(mask)], data_range=1) for p, t, mask in split
+            ]
+            np.testing.assert_allclose(summary[region][name], np.mean(psnrs), rtol=1e-10)
+    ssims = [structural_similarity(p, t, **REFERENCE) for p, t, _ in split]
+    np.testing.assert_allclose(summary["overall"]["ssim"], np.mean(ssims), atol=1e-12)
+    assert json.loads(json.dumps(summary)) == summary
+
+
+def test_gain_is_shared_by_the_split():
+    split = [(0.25 * truth, truth) for _, truth, _ in frames()]
+    scores = [metrics.compare(*frame) for frame in split]
+    np.testing.assert_allclose(metrics.gain([score["overall"] for score in scores]), 4, rtol=1e-12)
+    assert metrics.summarise(scores)["overall"]["psnr_gain"] > 100
+    uneven = [metrics.compare(factor * truth, truth) for factor, (_, truth) in zip((0.2, 0.5, 0.9), split, strict=True)]
+    assert metrics.summarise(uneven)["overall"]["psnr_gain"] < 20
+
+
+def test_psnr_gain_does_not_see_a_scaled_prediction():
+    plain, scaled = (
+        metrics.summarise([metrics.compare(factor * p, t, mask) for p, t, mask in frames()]) for factor in (1.0, 0.1)
+    )
+    for region in ("overall", "dynamic", "static"):
+        np.testing.assert_allclose(scaled[region]["psnr_gain"], plain[region]["psnr_gain"], rtol=1e-9)
+        assert scaled[region]["psnr"] < plain[region]["psnr"] - 3
+
+
+def test_black_predictions_keep_their_brightness():
+    truth = jnp.full((12, 12, 3), 0.5)
+    summary = metrics.summarise([metrics.compare(jnp.zeros_like(truth), truth)])
+    np.testing.assert_allclose(summary["overall"]["psnr_gain"], 20 * np.log10(2), rtol=1e-12)
+
+
+def test_regions_without_pixels_are_left_out():
+    prediction, truth, mask = next(frames())
+    nothing_moves = metrics.compare(prediction, truth, np.zeros_like(mask))
+    assert nothing_moves.keys() == {"overall", "static"}
+    assert metrics.compare(prediction, truth).keys() == {"overall"}
+    something_moves = metrics.compare(prediction, truth, mask)
+    summary = metrics.summarise([nothing_moves, something_moves])
+    np.testing.assert_allclose(summary["dynamic"]["psnr"], something_moves["dynamic"].psnr)
+
+
+def test_mixed_precision_frames_are_accepted():
+    prediction, truth, mask = next(frames())
+    single = metrics.compare(jnp.asarray(prediction, jnp.float32), truth, jnp.asarray(mask))
+    double = metrics.compare(prediction, truth, mask)
+    np.testing.assert_allclose(single["dynamic"].psnr, double["dynamic"].psnr, atol=1e-4)
