@@ -18,6 +18,8 @@ from l2dgs_jax.runs import Run
 from l2dgs_jax.types import RenderOutput
 from l2dgs_jax.visualize import expected_depth, replacing, to_bytes, view, write_image
 
+KINDS = ("welllit", "lowlight", "illumination", "reflectance", "depth")
+
 
 @dataclass(frozen=True)
 class Render:
@@ -55,16 +57,19 @@ def write_views(run: Run, split: Split, folder: Path) -> None:
     Raises:
         UserError: a file cannot be written.
     """
+    for kind in KINDS:
+        for name in split.names:
+            _make_folder((folder / kind / name).parent)
     depths = []
     for name, output in zip(split.names, views(run, split), strict=True):
-        for kind in ("welllit", "lowlight", "illumination", "reflectance"):
-            write_image(_image_path(folder, kind, name), to_bytes(getattr(output.images, kind)))
+        for kind in KINDS[:-1]:
+            write_image(folder / kind / f"{name}.png", to_bytes(getattr(output.images, kind)))
         depths.append(expected_depth(output))
 
     # One unit for all views, so that the depth of a video does not flicker.
     unit = max(float(max(depth.max() for depth in depths)), 1e-12) / 65535
     for name, depth in zip(split.names, depths, strict=True):
-        write_image(_image_path(folder, "depth", name), np.round(depth / unit).astype(np.uint16))
+        write_image(folder / "depth" / f"{name}.png", np.round(depth / unit).astype(np.uint16))
     with replacing(folder / "depth.json") as temporary:
         temporary.write_text(json.dumps({"unit": unit, "meaning": "depth = value * unit, 0 where empty"}) + "\n")
 
@@ -88,13 +93,11 @@ def choose_split(run: Run, name: str) -> Split:
     return split
 
 
-def _image_path(folder: Path, kind: str, name: str) -> Path:
-    path = folder / kind / f"{name}.png"
+def _make_folder(folder: Path) -> None:
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise UserError(f"{path.parent}: cannot be made ({error.strerror}); expected a folder to write to") from None
-    return path
+        raise UserError(f"{folder}: cannot be made ({error.strerror}); expected a folder to write to") from None
 
 
 if __name__ == "__main__":
