@@ -1,6 +1,5 @@
 """Image quality: PSNR and SSIM, their masked forms, and the scores of a held-out split."""
 
-import math
 from collections.abc import Sequence
 from functools import partial
 from typing import Literal, NamedTuple
@@ -27,16 +26,12 @@ class RegionScore(NamedTuple):
         ssim: mean of the SSIM map (of the windows inside the image for the whole frame).
         prediction_square: sum of p^2 over the region's values, p being the prediction and t the truth.
         product: sum of p t.
-        truth_square: sum of t^2.
-        values: how many values the region has (pixels times channels).
     """
 
     psnr: float
     ssim: float
     prediction_square: float
     product: float
-    truth_square: float
-    values: int
 
 
 def compare(prediction: Image, truth: Image, dynamic: Mask | None = None) -> dict[str, RegionScore]:
@@ -51,20 +46,18 @@ def compare(prediction: Image, truth: Image, dynamic: Mask | None = None) -> dic
         The score of "overall" and, given a mask, of "dynamic" and "static", those of them that have any pixel.
     """
     prediction, truth = np.asarray(prediction), np.asarray(truth, prediction.dtype)
-    everywhere = np.ones(prediction.shape[:2], bool)
-    scores = {"overall": _score(prediction, truth, everywhere, _ssim(prediction, truth))}
+    masks = {"overall": np.ones(prediction.shape[:2], bool)}
     if dynamic is not None:
-        dynamic = np.asarray(dynamic)
-        for region, mask in (("dynamic", dynamic), ("static", ~dynamic)):
-            if mask.any():
-                scores[region] = _score(prediction, truth, mask, _masked_ssim(prediction, truth, mask))
+        masks |= {"dynamic": np.asarray(dynamic), "static": ~np.asarray(dynamic)}
+    scores = {}
+    for region, mask in masks.items():
+        if region != "overall" and not mask.any():
+            continue
+        similarity = _ssim(prediction, truth) if region == "overall" else _masked_ssim(prediction, truth, mask)
+        p, t = prediction[mask].astype(np.float64), truth[mask].astype(np.float64)
+        decibels = _psnr(prediction, truth, mask)
+        scores[region] = RegionScore(float(decibels), float(similarity), float(np.sum(p * p)), float(np.sum(p * t)))
     return scores
-
-
-def _score(prediction: np.ndarray, truth: np.ndarray, mask: np.ndarray, similarity: Float[Array, ""]) -> RegionScore:
-    p, t = prediction[mask].astype(np.float64), truth[mask].astype(np.float64)
-    decibels = _psnr(prediction, truth, mask)
-    return RegionScore(float(decibels), float(similarity), np.sum(p * p), np.sum(p * t), np.sum(t * t), p.size)
 
 
 def gain(scores: Sequence[RegionScore]) -> float:
@@ -74,25 +67,15 @@ def gain(scores: Sequence[RegionScore]) -> float:
 
 
 def summarise(frames: Sequence[dict[str, RegionScore]]) -> dict[str, dict[str, float]]:
-    """Means over frames of what `compare` returned, per region.
-
-    Returns:
-        For each region that occurs, the means of "psnr" and "ssim", and "psnr_gain": the mean PSNR in dB after all
-        predictions were multiplied by the `gain` of the whole split (whole frames), unclipped.
-    """
-    g = gain([frame["overall"] for frame in frames])
-    summary = {}
-    for region in ("overall", "dynamic", "static"):
-        scores = [frame[region] for frame in frames if region in frame]
-        if not scores:
-            continue
-        errors = [max(g * g * s.prediction_square - 2 * g * s.product + s.truth_square, 0.0) / s.values for s in scores]
-        summary[region] = {
-            "psnr": float(np.mean([s.psnr for s in scores])),
-            "ssim": float(np.mean([s.ssim for s in scores])),
-            "psnr_gain": float(np.mean([-10 * math.log10(e) if e else math.inf for e in errors])),
+    """Means of "psnr" (dB) and "ssim" per region, each over the frames that `compare` scored the region in."""
+    regions = dict.fromkeys(region for frame in frames for region in frame)
+    return {
+        region: {
+            key: float(np.mean([getattr(frame[region], key) for frame in frames if region in frame]))
+            for key in ("psnr", "ssim")
         }
-    return summary
+        for region in regions
+    }
 
 
 def ssim_map(
