@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from l2dgs_jax.data import demo
-from l2dgs_jax.data.images import area_average, read_image, write_image
+from l2dgs_jax.data.images import area_average, read_image
+from l2dgs_jax.visualize import to_bytes, write_image
 
 FACTOR = 2
 README = """# The demo clip
@@ -47,7 +48,7 @@ def make(source: Path, target: Path, frames: int) -> None:
         camera["image_size"] = [x // FACTOR for x in camera["image_size"]]
         _write_json(target / "camera" / f"{name}.json", camera)
         image = area_average(read_image(source / "rgb" / "1x" / f"{name}.png"), FACTOR)
-        write_image(target / "rgb" / "1x" / f"{name}.png", image)
+        write_image(target / "rgb" / "1x" / f"{name}.png", to_bytes(image))
 
     train_ids = [name for name in ids if name not in val_ids]
     lists = {"count": len(ids), "num_exemplars": len(train_ids)}

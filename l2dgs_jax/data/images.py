@@ -1,4 +1,4 @@
-"""Pictures as arrays: sRGB values in [0, 1], `[H W 3]`, read and written by OpenImageIO."""
+"""Pictures as arrays: sRGB values in [0, 1], `[H W 3]`, read by OpenImageIO."""
 
 from contextlib import closing
 from pathlib import Path
@@ -35,23 +35,6 @@ def image_size(path: Path) -> tuple[int, int]:
     """
     with closing(_open(path)) as file:
         return file.spec().width, file.spec().height
-
-
-def write_image(path: Path, image: Float[np.ndarray, "H W 3"]) -> None:
-    """Write sRGB values, clipped to [0, 1], with 8 bits a channel; the suffix of `path` chooses the format.
-
-    Raises:
-        UserError: the file cannot be written.
-    """
-    pixels = np.rint(255 * np.clip(image, 0, 1)).astype(np.uint8)
-    spec = oiio.ImageSpec(image.shape[1], image.shape[0], image.shape[2], oiio.UINT8)
-    spec.attribute("oiio:ColorSpace", "sRGB")
-    spec.attribute("png:compressionLevel", 9)
-    file = oiio.ImageOutput.create(str(path))
-    if file is None:
-        raise UserError(f"{path}: expected a file name with the suffix of a picture ({_reason(oiio.geterror())})")
-    if not (file.open(str(path), spec) and file.write_image(np.ascontiguousarray(pixels)) and file.close()):
-        raise UserError(f"{path}: expected a place where a picture can be written ({_reason(file.geterror())})")
 
 
 def area_average(image: Float32[np.ndarray, "H W 3"], factor: int) -> Float32[np.ndarray, "h w 3"]:

@@ -200,8 +200,8 @@ def _read_json(path: Path, what: str) -> dict[str, Any]:
         raise UserError(f"{path}: no such file; expected {what}")
     try:
         content = json.loads(path.read_bytes())
-    except ValueError as error:
-        raise UserError(f"{path}: not valid JSON ({error}); expected {what}") from None
+    except (OSError, ValueError) as error:
+        raise UserError(f"{path}: cannot be read as JSON ({error}); expected {what}") from None
     if not isinstance(content, dict):
         raise UserError(f"{path}: holds a JSON {type(content).__name__}; expected an object with {what}")
     return content
