@@ -8,6 +8,7 @@ Instead of the lists in `dataset.json` there may be `splits/{train,val}.json` (D
 
 import json
 import re
+import reprlib
 from pathlib import Path
 from typing import Any
 
@@ -74,7 +75,7 @@ def _split(folder: Path) -> tuple[list[str], list[str], dict[str, float]]:
         train, val = listed[::4], listed[2::4][: (len(listed) - 1) // 4]
     if len(train) < 2 or not val:
         raise UserError(
-            f"{path}: lists {len(listed)} frames, {len(train)} to train with and {len(val)} held out; expected at "
+            f"{path}: {len(train)} frames to train with and {len(val)} held out, of {len(listed)} listed; expected at "
             "least 2 and 1, or 5 in all if none is marked as held out"
         )
     return train, val, _times(folder / "metadata.json", listed)
@@ -224,7 +225,7 @@ def _value(path: Path, content: dict[str, Any], key: str, kind: type) -> Any:
     if key not in content:
         raise UserError(f"{path}: '{key}' is missing; expected a JSON {_JSON_NAMES[kind]}")
     if not isinstance(content[key], kind):
-        raise UserError(f"{path}: '{key}' is {content[key]!r}; expected a JSON {_JSON_NAMES[kind]}")
+        raise UserError(f"{path}: '{key}' is {reprlib.repr(content[key])}; expected a JSON {_JSON_NAMES[kind]}")
     return content[key]
 
 
@@ -242,5 +243,5 @@ def _numbers(path: Path, content: dict[str, Any], key: str, shape: tuple[int, ..
     except (TypeError, ValueError):
         values = np.array(np.nan)
     if values.shape != shape or not np.isfinite(values).all():
-        raise UserError(f"{path}: '{key}' is {json.dumps(content[key])}; expected {wanted}, finite")
+        raise UserError(f"{path}: '{key}' is {reprlib.repr(content[key])}; expected {wanted}, finite")
     return values
