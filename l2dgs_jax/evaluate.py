@@ -75,7 +75,7 @@ def evaluate(run: Run, split_name: str = "test") -> dict:
         if split.welllit is not None:
             welllit.append(np.asarray(output.images.welllit, np.float16))  # as compact as the data set's own images
 
-    scores = _means(lowlight)
+    scores = metrics.summarise(lowlight)
     result: dict = {
         "split": split_name,
         "stage": "fine" if run.moving else "coarse",
@@ -124,8 +124,9 @@ def _with_gain(
     plain = [_compare(p, truths, masks, i) for i, p in enumerate(predictions)]
     gain = metrics.gain([frame["overall"] for frame in plain])
     gained = [_compare(gain * p.astype(np.float32), truths, masks, i) for i, p in enumerate(predictions)]
-    renamed = {region: {f"{k}_gain": v for k, v in means.items()} for region, means in _means(gained).items()}
-    return _means(plain), renamed, gain
+    after = metrics.summarise(gained)
+    renamed = {region: {f"{key}_gain": value for key, value in means.items()} for region, means in after.items()}
+    return metrics.summarise(plain), renamed, gain
 
 
 def _compare(
@@ -137,12 +138,6 @@ def _compare(
     """Score a prediction, clipped to [0, 1], of the frame `index`."""
     clipped = np.clip(np.asarray(prediction, np.float32), 0, 1)
     return metrics.compare(clipped, truths[index].astype(np.float32), None if masks is None else masks[index])
-
-
-def _means(frames: Sequence[dict[str, RegionScore]]) -> dict[str, dict[str, float]]:
-    """Per region, the mean PSNR and SSIM over the frames that show it."""
-    summary = metrics.summarise(frames)
-    return {region: {key: means[key] for key in ("psnr", "ssim")} for region, means in summary.items()}
 
 
 if __name__ == "__main__":

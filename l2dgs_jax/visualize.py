@@ -163,10 +163,11 @@ def write_image(path: Path, image: Shaped[np.ndarray, "H W *C"]) -> None:
     pixels = oiio.ImageBuf(np.ascontiguousarray(image))
     with replacing(path) as temporary:
         if not pixels.write(str(temporary)):
-            raise UserError(f"{path}: cannot be written ({pixels.geterror()}); expected a writable folder")
+            reason = " ".join(f"{pixels.geterror()} {oiio.geterror()}".split())
+            raise UserError(f"{path}: cannot be written ({reason}); expected a picture's suffix and a writable folder")
 
 
-def write_video(path: Path, frames: Iterable[UInt8[np.ndarray, "H W 3"]], fps: float) -> None:
+def write_video(path: Path, frames: Iterable[UInt8[np.ndarray, "H W 3"]], fps: int) -> None:
     """Write an .mp4 whole or not at all; odd sizes are padded by one row or column, as the codec wants even ones.
 
     Args:

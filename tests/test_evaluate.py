@@ -130,7 +130,7 @@ def test_split_without_views(run):
 
 def test_table_shows_every_score(result):
     lines = table(result).splitlines()
-    assert lines[0] == "3 test views, fine stage, step 6"
+    assert lines[0] == "2 test views, fine stage, step 6"
     overall = next(line for line in lines if line.startswith("well-lit")).split()[1:]
     scores = result["welllit"]["overall"]
     assert overall == [
@@ -161,7 +161,7 @@ def test_command_scores_the_coarse_stage_and_the_training_views(base, result, tm
     assert (coarse["stage"], coarse["step"], coarse["split"]) == ("coarse", 3, "train")
     assert coarse["frames"] == finished_run.FRAMES - len(finished_run.HELD_OUT)
     assert coarse["lowlight"] != result["lowlight"]
-    assert "6 train views, coarse stage, step 3" in capsys.readouterr().out
+    assert "8 train views, coarse stage, step 3" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

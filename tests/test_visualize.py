@@ -21,7 +21,7 @@ def walk(frames=40, jitter=0.0, seed=0):
     rng = np.random.default_rng(seed)
     time = np.linspace(0, 1, frames)
     centres = np.stack([2 * time, 0.1 * np.sin(3 * time), 0.2 * time], -1) + jitter * rng.normal(size=(frames, 3))
-    rotations = Rotation.from_euler("y", 0.5 * time).as_matrix()
+    rotations = Rotation.from_rotvec(np.outer(0.5 * time, [0, 1, 0])).as_matrix()
     viewmat = np.tile(np.eye(4), (frames, 1, 1))
     viewmat[:, :3, :3] = rotations
     viewmat[:, :3, 3] = -np.einsum("fij,fj->fi", rotations, centres)
