@@ -29,6 +29,8 @@ class ModelConfig:
     attenuation_init: Literal["normal", "uniform"] = "uniform"
     # B1, B2 that BAFE-Net starts at; None: zero bias, 5.5. B1 "auto": what the frames' darkness implies (tone.py)
     initial_exponents: tuple[float | Literal["auto"], float] | None = None
+    # l of every Gaussian at the start; None: luminance of the points. "auto": what makes L^B2 the darkening's gain
+    initial_illumination: float | Literal["auto"] | None = None
     initial_opacity: float = 0.1
     background: float = 0.0  # value of L and R where nothing is drawn
 
@@ -159,7 +161,7 @@ def _presets() -> dict[str, Config]:
         optim=OptimConfig(extent_scales=("means", "heads", "planes", "ocd", "bafe")),
     )
     default = Config(
-        model=ModelConfig(identity_start=True, initial_exponents=("auto", 9.0)),
+        model=ModelConfig(identity_start=True, initial_exponents=("auto", 9.0), initial_illumination="auto"),
         loss=LossConfig(
             exposure=1.0,
             exposure_level=0.46,

@@ -1,29 +1,59 @@
-"""Deformation."""
+"""Canonical Gaussians and instants -> Gaussians at those instants, lit as their cameras see them (Eqs. 1-4)."""
+
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
 from l2dgs_jax import hexplane, networks, spherical_harmonics
-from l2dgs_jax.types import MovedGaussians
+from l2dgs_jax.config import ModelConfig
+from l2dgs_jax.types import Camera, MovedGaussians, SceneParams
 
 
-def deform(params, alive, bounds, cameras, cfg, *, moving, sh_degree_active):
-    g = params.gaussians
-    views = cameras.time.shape[0]
-    spread = lambda x: jnp.broadcast_to(x[None], (views, *x.shape))
-    centres = -jnp.einsum("vji,vj->vi", cameras.viewmat[:, :3, :3], cameras.viewmat[:, :3, 3])
-    directions = spherical_harmonics.directions(spread(g.means), centres)
-    basis = spherical_harmonics.basis(directions, cfg.sh_degree)
-    degrees = jnp.array([d for d in range(cfg.sh_degree + 1) for _ in range(2 * d + 1)])
-    b = jnp.concatenate([g.illumination_dc, g.illumination_rest], -1) * (degrees <= sh_degree_active)[None].astype(g.means.dtype)
-    means, quats, log_scales, a = spread(g.means), spread(g.quats), spread(g.log_scales), 1.0
+def deform(
+    params: SceneParams,
+    alive: Bool[Array, "N"],
+    bounds: Float[Array, "2 3"],
+    cameras: Camera,
+    cfg: ModelConfig,
+    *,
+    moving: bool,
+    sh_degree_active: Int[Array, ""] | int,
+) -> MovedGaussians:
+    """Move and light every Gaussian for V cameras, each at its own instant.
+
+    Gradients flow to every leaf of `params` that takes part and to `cameras`; rows that are not alive get none.
+
+    Args:
+        params: learned values; `params.bafe` is not used.
+        alive: which rows exist. The others come out with opacity 0, whatever their parameters.
+        bounds: lowest and highest corner of the HexPlane's box, world units.
+        cameras: V cameras.
+        cfg: shape of the scene.
+        moving: whether the motion field and OCD-Net act (fine stage); otherwise the canonical Gaussians, with a_j = 1.
+        sh_degree_active: bands of Eq. 2 above this one are left out; may be traced.
+
+    Returns:
+        Activated Gaussians; every field has a leading axis V.
+    """
+    # Garbage in a dead row could overflow the exponential, and 0 * inf would reach the shared networks as NaN.
+    gaussians = jax.tree.map(
+        lambda rows: jnp.where(alive.reshape(-1, *[1] * (rows.ndim - 1)), rows, 0), params.gaussians
+    )
+    per_view = lambda rows: jnp.broadcast_to(rows[None], (*cameras.time.shape, *rows.shape))
+    means, quats, log_scales = map(per_view, (gaussians.means, gaussians.quats, gaussians.log_scales))
+    coefficients = _active_coefficients(gaussians, cfg.sh_degree, sh_degree_active)
     if moving:
-        space = hexplane.space_features(params.hexplane, g.means, bounds)
-
-        def at(t):
-            f = hexplane.features(params.hexplane, space, g.means, bounds, t, cfg)
-            hidden, dm, dq, ds = networks.apply_heads(params.heads, f)
-            return g.means + dm, g.quats + dq, g.log_scales + ds, networks.apply_ocd(params.ocd, hidden)
-
-        means, quats, log_scales, a = jax.vmap(at)(cameras.time)
-    illumination = jnp.maximum(cfg.illumination_offset + (a * spread(b) * basis).sum(-1), 0)
-    opacity = jax.nn.sigmoid(g.logit_opacities) * alive.astype(g.means.dtype)
-    return MovedGaussians(means, quats, jnp.exp(log_scales), spread(opacity), illumination, spread(g.reflectance), spread(g.attenuation))
+        # The same features feed the heads and OCD-Net: Eqs. 1 and 4 name them both f.
+        field = hexplane.features(params.hexplane, gaussians.means, bounds, cameras.time, cfg)
+        hidden, *motion = networks.apply_heads(params.heads, field)
+        means, quats, log_scales = means + motion[0], quats + motion[1], log_scales + motion[2]
+        coefficients = networks.apply_ocd(params.ocd, hidden) * coefficients
+    return MovedGaussians(
+        means=means,
+        quats=quats,
+        scales=jnp.exp(log_scales),
+        opacities=per_view(jnp.where(alive, jax.nn.sigmoid(gaussians.logit_opacities), 0)),
+        illumination=_illumination(coefficients, gaussians.means, cameras.viewmat, cfg),
+        reflectance=per_view(gaussians.reflectance),
+        attenuation=per_view(gaussians.attenuation),
+    )

@@ -18,7 +18,7 @@ from l2dgs_jax.data.dataset import Dataset, Split
 from l2dgs_jax.density import GrowthStats
 from l2dgs_jax.rendering import render
 from l2dgs_jax.scene import groups, initialise, pad_rows, rung
-from l2dgs_jax.tone import darkening_exponent
+from l2dgs_jax.tone import darkening
 from l2dgs_jax.types import Camera, Scene, SceneParams
 
 with warnings.catch_warnings():
@@ -161,13 +161,14 @@ def adam(params: SceneParams, rates: dict[str, optim.Schedule], config: Config) 
 
 def resolve(config: Config, split: Split) -> Config:
     """The settings with what they leave to the data filled in from the training frames."""
-    exponents = config.model.initial_exponents
-    if exponents is None or exponents[0] != "auto":
-        return config
-    b1 = darkening_exponent(float(split.images.mean(dtype=np.float64)), config.loss.exposure_level)
-    return dataclasses.replace(
-        config, model=dataclasses.replace(config.model, initial_exponents=(round(b1, 3), exponents[1]))
-    )
+    model, dark_level = config.model, float(split.images.mean(dtype=np.float64))
+    exponent, gain = darkening(dark_level, config.loss.exposure_level)
+    b1, b2 = model.initial_exponents or (None, None)
+    if b1 == "auto":
+        model = dataclasses.replace(model, initial_exponents=(round(exponent, 3), b2))
+    if model.initial_illumination == "auto":
+        model = dataclasses.replace(model, initial_illumination=round(gain ** (1 / (b2 or 1)), 3))
+    return dataclasses.replace(config, model=model)
 
 
 def initial_state(dataset: Dataset, config: Config) -> TrainState:

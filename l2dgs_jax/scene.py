@@ -43,7 +43,7 @@ def initialise(
     """A scene with one Gaussian a point, ready for training.
 
     Scales are the root mean square distance to the three nearest points, illumination the luminance of the point
-    (mid-grey without colours), opacity `cfg.initial_opacity`, reflectance and attenuation random (paper, section 4).
+    (mid-grey without colours) unless `cfg.initial_illumination` says otherwise, opacity `cfg.initial_opacity`, reflectance and attenuation random (paper, section 4).
 
     Args:
         key: randomness of reflectance, attenuation, planes and networks.
@@ -59,7 +59,10 @@ def initialise(
 
     distances, _ = cKDTree(points).query(points, k=min(4, count))
     mean_square = np.square(distances[:, 1:]).mean(-1) if count > 1 else np.ones(count)
-    grey = np.full(count, 0.5) if colors is None else np.asarray(colors) @ LUMINANCE
+    if cfg.initial_illumination is not None:
+        illumination = np.full(count, cfg.initial_illumination)
+    else:
+        illumination = np.full(count, 0.5) if colors is None else np.asarray(colors) @ LUMINANCE
     random = {"normal": jax.random.normal, "uniform": jax.random.uniform}
     coefficients = (cfg.sh_degree + 1) ** 2
 
@@ -68,7 +71,7 @@ def initialise(
         quats=pad(np.tile([1.0, 0.0, 0.0, 0.0], (count, 1))),
         log_scales=pad(np.tile(0.5 * np.log(np.maximum(mean_square, 1e-7))[:, None], 3)),
         logit_opacities=pad(np.full(count, np.log(cfg.initial_opacity / (1 - cfg.initial_opacity)))),
-        illumination_dc=pad((grey - cfg.illumination_offset)[:, None] / SH_DC),
+        illumination_dc=pad((illumination - cfg.illumination_offset)[:, None] / SH_DC),
         illumination_rest=jnp.zeros((capacity, coefficients - 1)),
         reflectance=pad(random[cfg.reflectance_init](keys[0], (count, 3))),
         attenuation=pad(random[cfg.attenuation_init](keys[1], (count, 2))),

@@ -1,4 +1,6 @@
-"""What underexposure does to an sRGB image: the prior for B1, the exponent between R_w and the dark input."""
+"""What underexposure does to an sRGB image: where B1 and L_w start."""
+
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -14,22 +16,26 @@ def linear_to_srgb(value: Float[np.ndarray, "*S"]) -> Float[np.ndarray, "*S"]:
     return np.where(value <= 0.0031308, value * 12.92, 1.055 * value ** (1 / 2.4) - 0.055)
 
 
-def darkening_exponent(dark_level: float, lit_level: float) -> float:
+class Darkening(NamedTuple):
+    """An underexposed sRGB value as gain * (well-exposed value)^exponent."""
+
+    exponent: float
+    gain: float
+
+
+def darkening(dark_level: float, lit_level: float) -> Darkening:
     """The power law that best describes an underexposed sRGB image of mean `dark_level`.
 
     Light scaled by k before the sRGB curve is close to a gain times a power of the well-exposed value after it, with
-    an exponent above 1 that grows with darkness. k follows from the two levels; the power is fitted by least squares
-    in log-log coordinates over the mid-tones, sRGB 0.1 to 0.9.
+    an exponent above 1 that grows with darkness. k follows from the two levels; the law is fitted by least squares in
+    log-log coordinates over the mid-tones, sRGB 0.1 to 0.9, with the exponent limited to [1.01, 2].
 
     Args:
         dark_level: mean sRGB value of the dark frames, in (0, 1).
         lit_level: mean sRGB value that a well-lit image is expected to have.
-
-    Returns:
-        An exponent in [1.01, 2].
     """
     dark, lit = srgb_to_linear(np.array([dark_level, lit_level]))
     well = np.linspace(0.1, 0.9, 81)
     low = linear_to_srgb(min(dark / lit, 1.0) * srgb_to_linear(well))
-    slope = np.polyfit(np.log(well), np.log(low), 1)[0]
-    return float(np.clip(slope, 1.01, 2.0))
+    exponent = np.clip(np.polyfit(np.log(well), np.log(low), 1)[0], 1.01, 2.0)
+    return Darkening(float(exponent), float(np.exp(np.mean(np.log(low) - exponent * np.log(well)))))

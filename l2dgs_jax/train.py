@@ -114,7 +114,12 @@ def _consume(steps: Iterator[engine.Progress], folder: Path, config: Config, don
             if step % LOG_EVERY == 0 or step == config.steps:
                 stage = "coarse" if step <= config.coarse_steps else "fine"
                 values = {"loss": report.loss, "psnr": report.psnr, **report.terms}
-                line = {"step": step, "stage": stage, "gaussians": int(state.scene.alive.sum())}
+                line = {
+                    "step": step,
+                    "stage": stage,
+                    "gaussians": int(state.scene.alive.sum()),
+                    "pairs": int(report.pairs),
+                }
                 line |= {name: round(float(value), 6) for name, value in values.items()}
                 log.write(json.dumps(line | {"seconds": round(time.monotonic() - begun, 2)}) + "\n")
                 log.flush()

@@ -52,7 +52,7 @@ def contact_sheet(run: Run, rows: int = 4) -> UInt8[np.ndarray, "H W 3"]:
         "depth": tuple(np.percentile(depths, (2, 98))),
     }
     columns = [name for name in COLUMNS if name != "truth" or split.welllit is not None]
-    headings = [f"{name} {ranges[name][0]:.3g}-{ranges[name][1]:.3g}" if name in ranges else name for name in columns]
+    headings = [f"{name} {ranges[name][0]:.4g}-{ranges[name][1]:.4g}" if name in ranges else name for name in columns]
 
     lines = []
     for row, i in enumerate(chosen):

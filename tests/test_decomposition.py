@@ -1,5 +1,3 @@
-from functools import partial
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -30,21 +28,25 @@ def make_features(*shape, low=0.1, high=0.9, dtype=jnp.float64):
     return jnp.asarray(np.random.default_rng(1).uniform(low, high, (*shape, 6)), dtype)
 
 
-@partial(jax.jit, static_argnames="argnum")
-def gradient(features, bafe, argnum=0):
+@jax.jit
+def gradients(features, bafe):
     """Of the sum of all images."""
 
     def objective(features, bafe):
         return sum(image.sum() for image in decompose(features, bafe))
 
-    return jax.grad(objective, argnum)(features, bafe)
+    return jax.grad(objective, (0, 1))(features, bafe)
+
+
+def all_finite(tree):
+    return all(jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(tree))
 
 
 def test_images_follow_eqs_5_to_9():
-    features, bafe = make_features(2, 5, 6, low=-0.5, high=1.5), make_bafe()
+    features, bafe = make_features(2, 4, 5, low=-0.5, high=1.5), make_bafe()
     images = jax.tree.map(np.asarray, decompose_jit(features, bafe))
     exponents = np.asarray(apply_bafe(bafe, features[..., 4:]))
-    for index in np.ndindex(2, 5, 6):
+    for index in np.ndindex(2, 4, 5):
         illumination = min(max(float(features[index][0]), 0.0), 1.0)
         np.testing.assert_allclose(images.illumination[index], illumination, rtol=1e-12)
         np.testing.assert_allclose(images.attenuation[index], exponents[index], rtol=1e-9)
@@ -58,23 +60,26 @@ def test_images_follow_eqs_5_to_9():
 
 
 def test_the_low_light_image_is_never_brighter():
-    images = decompose_jit(make_features(2, 5, 6, low=-0.5, high=1.5), make_bafe())
+    images = decompose_jit(make_features(2, 4, 5, low=-0.5, high=1.5), make_bafe())
     assert (images.lowlight <= images.welllit).all()
     assert (images.attenuation > 1).all()
     assert (images.attenuation < 10).all()
 
 
 def test_gradients_of_the_images():
-    features, bafe = make_features(1, 4, 5), make_bafe()
+    features, bafe = make_features(2, 4, 5), make_bafe()
     check_grads(jax.jit(decompose), (features, bafe), 1, ("fwd", "rev"), 1e-5, 1e-5, eps=1e-6)
 
 
 def test_gradients_of_power():
     base = jnp.asarray(np.random.default_rng(2).uniform(0.05, 1, (3, 4)))
     exponent = 1 + 9 * jnp.asarray(np.random.default_rng(3).uniform(size=(3, 4)))
-    check_grads(jax.jit(power), (base, exponent), 2, ("fwd", "rev"), 1e-5, 1e-5, eps=1e-5)
+    check_grads(jax.jit(power), (base, exponent), 1, ("fwd", "rev"), 1e-5, 1e-5, eps=1e-6)
     check_grads(jax.jit(power), (base, exponent[:, :1]), 1, ("fwd", "rev"), 1e-5, 1e-5, eps=1e-6)
     check_grads(jax.jit(power), (base, exponent[0, 0]), 1, ("fwd", "rev"), 1e-5, 1e-5, eps=1e-6)
+
+
+power_gradients = jax.jit(jax.grad(lambda base, exponent: power(base, exponent).sum(), (0, 1)))
 
 
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
@@ -84,9 +89,9 @@ def test_power_near_zero(dtype):
     for exponent in (1.0, 1.5, 10.0):
         exponents = jnp.full_like(base, exponent)
         values = power(base, exponents)
-        slopes = jax.grad(lambda b, e: power(b, e).sum(), (0, 1))(base, exponents)
+        slopes = power_gradients(base, exponents)
         np.testing.assert_allclose(values, np.asarray(base) ** exponent, atol=1e-12)
-        assert all(jnp.isfinite(slope).all() for slope in slopes)
+        assert all_finite(slopes)
         assert slopes[1][0] == 0
         assert slopes[0][0] == 0
 
@@ -100,33 +105,32 @@ def test_clipping_is_live_on_its_bounds_and_dead_outside():
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 @pytest.mark.parametrize("level", [0.0, 1.0, -3.0, 3.0, 1e-38, 1e30, -1e30])
 def test_flat_features_stay_finite(level, dtype):
-    features, bafe = jnp.full((1, 4, 5, 6), level, dtype), make_bafe(dtype)
+    features, bafe = jnp.full((2, 4, 5, 6), level, dtype), make_bafe(dtype)
     for image in decompose_jit(features, bafe):
         assert image.dtype == dtype
         assert jnp.isfinite(image).all()
-    for argnum in (0, 1):
-        assert all(jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient(features, bafe, argnum)))
+    assert all_finite(gradients(features, bafe))
 
 
 @pytest.mark.parametrize("channels", [slice(0, 1), slice(1, 4)], ids=["black L", "black R"])
 def test_one_black_factor_blackens_both_images(channels):
-    features = make_features(1, 4, 5).at[..., channels].set(0.0)
+    features = make_features(2, 4, 5).at[..., channels].set(0.0)
     images = decompose_jit(features, make_bafe())
     assert not images.welllit.any()
     assert not images.lowlight.any()
-    assert jnp.isfinite(gradient(features, make_bafe())).all()
+    assert all_finite(gradients(features, make_bafe()))
 
 
 def test_one_pixel():
     features = make_features(1, 1, 1)
-    assert all(jnp.isfinite(image).all() for image in decompose_jit(features, make_bafe()))
-    assert jnp.isfinite(gradient(features, make_bafe())).all()
+    assert all_finite(decompose_jit(features, make_bafe()))
+    assert all_finite(gradients(features, make_bafe()))
 
 
 def test_batches_are_independent_views():
-    features, bafe = make_features(2, 3, 4, 5), make_bafe()
+    features, bafe = make_features(2, 4, 5), make_bafe()
     together = decompose_jit(features, bafe)
-    for index in np.ndindex(2, 3):
+    for index in range(2):
         alone = decompose_jit(features[index], bafe)
         for a, b in zip(together, alone, strict=True):
             np.testing.assert_allclose(a[index], b, rtol=1e-9)

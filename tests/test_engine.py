@@ -21,7 +21,17 @@ WIDTH, HEIGHT, FRAMES = 16, 12, 6
 def tiny(preset="default", **changes):
     base = PRESETS[preset]
     exponents = base.model.initial_exponents and (1.5, 9.0)
-    small = dataclasses.replace(base.model, initial_exponents=exponents, plane_size=4, plane_scales=(1, 2), plane_channels=2, hidden=8, sh_degree=1)
+    illumination = base.model.initial_illumination and 0.8
+    small = dataclasses.replace(
+        base.model,
+        initial_exponents=exponents,
+        initial_illumination=illumination,
+        plane_size=4,
+        plane_scales=(1, 2),
+        plane_channels=2,
+        hidden=8,
+        sh_degree=1,
+    )
     density = DensityConfig(start=1, stop=100, interval=3, grad_threshold=1e-9, max_gaussians=60)
     changes = {"coarse_steps": 4, "fine_steps": 4, "sh_warmup": 3, "density": density, "model": small} | changes
     return dataclasses.replace(base, **changes)
@@ -119,8 +129,10 @@ def test_probe_gradient_is_the_gradient_of_moving_on_screen(dataset):
 
 def test_training_lowers_the_loss_and_grows(dataset):
     config = tiny(coarse_steps=40, fine_steps=0)
-    reports = [(float(p.report.loss), int(p.state.scene.alive.sum())) for p in engine.run(
-        dataset.train, config, engine.initial_state(dataset, config))]
+    reports = [
+        (float(p.report.loss), int(p.state.scene.alive.sum()))
+        for p in engine.run(dataset.train, config, engine.initial_state(dataset, config))
+    ]
     losses, counts = zip(*reports, strict=True)
     assert np.mean(losses[-5:]) < 0.9 * np.mean(losses[:5])
     assert counts[-1] == 60 > counts[0] == 25

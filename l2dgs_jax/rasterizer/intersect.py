@@ -21,9 +21,9 @@ class TileLists(NamedTuple):
         stops: where it ends.
     """
 
-    gaussians: Int[Array, "M"]
-    starts: Int[Array, "T"]
-    stops: Int[Array, "T"]
+    gaussians: Int[Array, " M"]
+    starts: Int[Array, " T"]
+    stops: Int[Array, " T"]
 
 
 class Footprints(NamedTuple):
@@ -73,8 +73,8 @@ def pairs_needed(boxes: Footprints) -> Int[Array, ""]:
 
 
 def _touches(
-    means2d: Float[Array, "M 2"], conics: Float[Array, "M 3"], reach: Float[Array, "M"], corner: Float[Array, "M 2"]
-) -> Bool[Array, "M"]:
+    means2d: Float[Array, "M 2"], conics: Float[Array, "M 3"], reach: Float[Array, " M"], corner: Float[Array, "M 2"]
+) -> Bool[Array, " M"]:
     """Whether an ellipse reaches a tile's rectangle of pixel centres, whose lowest corner is `corner`.
 
     A convex quadratic takes its minimum over a rectangle that excludes its centre on one of the (at most two) sides
@@ -90,8 +90,8 @@ def _touches(
 
 
 def _sorted(
-    tiles: Int[Array, "M"], ranks: Int[Array, "M"], tile_count: int, rank_count: int
-) -> tuple[Int[Array, "M"], Int[Array, "M"], Int[Array, "T1"]]:
+    tiles: Int[Array, " M"], ranks: Int[Array, " M"], tile_count: int, rank_count: int
+) -> tuple[Int[Array, " M"], Int[Array, " M"], Int[Array, " T1"]]:
     """Pairs sorted by (tile, rank), and where each tile starts. Tile number `tile_count` collects the dropped pairs."""
     bits = rank_count.bit_length()
     borders = jnp.arange(tile_count + 1, dtype=jnp.uint32)
