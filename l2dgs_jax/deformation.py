@@ -2,16 +2,17 @@
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from l2dgs_jax import hexplane, networks, spherical_harmonics
 from l2dgs_jax.config import ModelConfig
-from l2dgs_jax.types import Camera, MovedGaussians, SceneParams
+from l2dgs_jax.types import Camera, Gaussians, MovedGaussians, SceneParams
 
 
 def deform(
     params: SceneParams,
-    alive: Bool[Array, "N"],
+    alive: Bool[Array, " N"],
     bounds: Float[Array, "2 3"],
     cameras: Camera,
     cfg: ModelConfig,
@@ -57,3 +58,25 @@ def deform(
         reflectance=per_view(gaussians.reflectance),
         attenuation=per_view(gaussians.attenuation),
     )
+
+
+def _active_coefficients(gaussians: Gaussians, degree: int, active: Int[Array, ""] | int) -> Float[Array, "1 N J"]:
+    """The b_j of Eq. 2, those of bands above `active` set to zero."""
+    coefficients = jnp.concatenate([gaussians.illumination_dc, gaussians.illumination_rest], axis=-1)
+    bands = np.repeat(np.arange(degree + 1), 2 * np.arange(degree + 1) + 1)
+    return jnp.where((bands <= active)[None], coefficients, 0)[None]
+
+
+def _illumination(
+    coefficients: Float[Array, "U N J"], means: Float[Array, "N 3"], viewmat: Float[Array, "V 4 4"], cfg: ModelConfig
+) -> Float[Array, "V N"]:
+    """The illumination l of Eqs. 2 and 3, coefficients a_j b_j given for each view or once for all.
+
+    The view direction is taken from the canonical mean: the coefficients belong to the Gaussian, so its motion alone
+    does not change how it is lit. What does change is OCD-Net's part.
+    """
+    rotation, translation = viewmat[:, :3, :3], viewmat[:, :3, 3]
+    centres = -jnp.einsum("vji,vj->vi", rotation, translation)
+    directions = spherical_harmonics.directions(jnp.broadcast_to(means[None], (len(viewmat), *means.shape)), centres)
+    lit = jnp.sum(coefficients * spherical_harmonics.basis(directions, cfg.sh_degree), axis=-1)
+    return jnp.maximum(cfg.illumination_offset + lit, 0)

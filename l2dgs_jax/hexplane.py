@@ -47,7 +47,7 @@ def features(
     planes: HexPlane,
     points: Float[Array, "N 3"],
     bounds: Float[Array, "2 3"],
-    times: Float[Array, "V"],
+    times: Float[Array, " V"],
     cfg: ModelConfig,
 ) -> Float[Array, "V N F"]:
     """Features of every point at every time, before the aggregation g (Eq. 1).
@@ -72,19 +72,19 @@ def features(
     times = jnp.clip(times if cfg.time_range == "full" else 0.5 + 0.5 * times, 0, 1)
     scales = []
     for space, time in zip(planes.space, planes.time, strict=True):
-        pairs = list(zip(_space_lookup(space, unit), _time_lookup(time, unit, times), strict=True))
+        xy, yz, zx = _space_lookup(space, unit)
+        zt, xt, yt = _time_lookup(time, unit, times)
         if cfg.aggregation == "paired_sum":
-            scales.append(sum(plane[None] * line for plane, line in pairs[1:]) + pairs[0][0][None] * pairs[0][1])
+            scales.append(xy[None] * zt + yz[None] * xt + zx[None] * yt)
         else:
-            (a, b), (c, d), (e, f) = pairs
-            scales.append((a * c * e)[None] * (b * d * f))
+            scales.append((xy * yz * zx)[None] * (zt * xt * yt))
     return jnp.concatenate(scales, axis=-1)
 
 
 def regularisers(planes: HexPlane) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
-    """The three penalties of 4DGS (arXiv 2310.08528) on the planes, each a mean per plane, summed over planes and scales.
+    """The three penalties of 4DGS (arXiv 2310.08528) on the planes. Gradients flow to `planes`.
 
-    Gradients flow to `planes`.
+    Each is a mean over the entries of a plane, summed over planes and scales.
 
     Returns:
         plane_smoothness: squared second differences of the space planes along their first axis only.
@@ -130,7 +130,7 @@ def _space_lookup(planes: Float[Array, "3 S S C"], unit: Float[Array, "N 3"]) ->
 
 
 def _time_lookup(
-    planes: Float[Array, "3 T S C"], unit: Float[Array, "N 3"], times: Float[Array, "V"]
+    planes: Float[Array, "3 T S C"], unit: Float[Array, "N 3"], times: Float[Array, " V"]
 ) -> list[Float[Array, "V N C"]]:
     """Values of the planes Zt, Xt, Yt: mixed in time first, then read along the line that remains."""
     time_size, size, channels = planes.shape[1:]
@@ -139,7 +139,7 @@ def _time_lookup(
     lines = (1 - mix) * planes[:, row] + mix * planes[:, row + 1]
     table = lines.reshape(-1, channels)
     low, weight = _cell(unit, size)
-    views = jnp.arange(times.shape[0])[:, None]
+    views = jnp.arange(times.shape[0], dtype=low.dtype)[:, None]
     values = []
     for plane, axis in enumerate(TIME_AXES):
         start = (plane * times.shape[0] + views) * size + low[None, :, axis]

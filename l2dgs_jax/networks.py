@@ -1,83 +1,179 @@
-"""Networks."""
+"""The small networks, motion heads, OCD-Net and BAFE-Net: `init_*` -> parameters, `apply_*(parameters, x)` -> y.
+
+The paper leaves their layers to its supplement; sizes and activations here are those of the authors' release.
+"""
+
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from l2dgs_jax.config import ModelConfig
 from l2dgs_jax.types import BAFENet, Conv, GroupNorm, Linear, MotionHeads, OCDNet
 
+# B1 and B2 lie in the open interval CENTRE - REACH ... CENTRE + REACH.
+EXPONENT_CENTRE = 5.5
+EXPONENT_REACH = 4.5
+LEAK = 0.01
+GROUP_NORM_EPS = 1e-5
+SKIP_GAIN = 0.3  # of BAFE-Net's first block where it rejoins the third
 
-def _xavier(key, shape, fan_in, fan_out):
+
+def init_heads(key: PRNGKeyArray, feature_size: int, cfg: ModelConfig) -> MotionHeads:
+    """The aggregation g of Eq. 1 and the mu, Q and S heads: Xavier-uniform weights, zero biases.
+
+    With `cfg.identity_start` the last layer of each head is zero: no motion, yet live gradients in that layer.
+
+    Args:
+        key: randomness of the weights.
+        feature_size: channels of a HexPlane feature.
+        cfg: `hidden` and `identity_start`.
+    """
+    keys = jax.random.split(key, 7)
+
+    def head(first: PRNGKeyArray, last: PRNGKeyArray, size: int) -> tuple[Linear, Linear]:
+        out = _linear(last, cfg.hidden, size)
+        return _linear(first, cfg.hidden, cfg.hidden), jax.tree.map(jnp.zeros_like, out) if cfg.identity_start else out
+
+    return MotionHeads(
+        aggregate=_linear(keys[0], feature_size, cfg.hidden),
+        mean=head(keys[1], keys[2], 3),
+        quat=head(keys[3], keys[4], 4),
+        scale=head(keys[5], keys[6], 3),
+    )
+
+
+def apply_heads(
+    heads: MotionHeads, features: Float[Array, "*B F"]
+) -> tuple[Float[Array, "*B H"], Float[Array, "*B 3"], Float[Array, "*B 4"], Float[Array, "*B 3"]]:
+    """Displacements at an instant, to be added to raw parameters. Gradients flow to both arguments.
+
+    Args:
+        heads: parameters.
+        features: HexPlane features.
+
+    Returns:
+        f of Eq. 1, and the additions to means, quaternions and logarithmic scales.
+    """
+    hidden = _affine(heads.aggregate, features)
+    active = jax.nn.relu(hidden)
+    move = lambda head: _affine(head[1], jax.nn.relu(_affine(head[0], active)))
+    return hidden, move(heads.mean), move(heads.quat), move(heads.scale)
+
+
+def init_ocd(key: PRNGKeyArray, cfg: ModelConfig) -> OCDNet:
+    """OCD-Net (Eq. 4): Xavier-uniform weights, zero biases.
+
+    With `cfg.identity_start` every a_j starts at exactly 1, on the live side of the last ReLU. Without, about half of
+    them start at 0 and the illumination jumps when OCD-Net joins.
+
+    Args:
+        key: randomness of the weights.
+        cfg: `hidden`, `sh_degree` and `identity_start`.
+    """
+    first, last = jax.random.split(key)
+    out = _linear(last, cfg.hidden, (cfg.sh_degree + 1) ** 2)
+    if cfg.identity_start:
+        out = Linear(jnp.zeros_like(out.weight), jnp.ones_like(out.bias))
+    return OCDNet(_linear(first, cfg.hidden, cfg.hidden), out)
+
+
+def apply_ocd(ocd: OCDNet, hidden: Float[Array, "*B H"]) -> Float[Array, "*B J"]:
+    """The factors a_j(t) >= 0 of Eq. 4. Gradients flow to both arguments.
+
+    Args:
+        ocd: parameters.
+        hidden: f of Eq. 1.
+    """
+    return jax.nn.relu(_affine(ocd.out, jax.nn.elu(_affine(ocd.hidden, jax.nn.elu(hidden)))))
+
+
+def init_bafe(key: PRNGKeyArray, cfg: ModelConfig) -> BAFENet:
+    """BAFE-Net: Xavier-uniform kernels, zero biases, exponents near 5.5.
+
+    With `cfg.initial_exponents` the last layer starts with those exponents in its bias and a zero kernel, so that the
+    exponents start there exactly; its first step makes the kernel non-zero and the earlier layers begin to learn.
+
+    Args:
+        key: randomness of the kernels.
+        cfg: `initial_exponents`.
+
+    Raises:
+        ValueError: an initial exponent is not a number strictly between 1 and 10.
+    """
+    keys = jax.random.split(key, 4)
+    norm = lambda channels: GroupNorm(jnp.ones(channels), jnp.zeros(channels))
+    out = _conv_init(keys[3], 1, 8, 2)
+    if cfg.initial_exponents is not None:
+        raw = jnp.array([_exponent_inverse(value) for value in cfg.initial_exponents], out.bias.dtype)
+        out = Conv(jnp.zeros_like(out.weight), raw)
+    return BAFENet(
+        conv1=_conv_init(keys[0], 5, 2, 8),
+        norm1=norm(8),
+        conv2=_conv_init(keys[1], 3, 8, 16),
+        norm2=norm(16),
+        conv3=_conv_init(keys[2], 3, 16, 8),
+        norm3=norm(8),
+        out=out,
+    )
+
+
+def apply_bafe(bafe: BAFENet, attenuation: Float[Array, "*B H W 2"]) -> Float[Array, "*B H W 2"]:
+    """The exponents B1 and B2 of Eq. 9, each in (1, 10). Gradients flow to both arguments.
+
+    Normalisation uses the statistics of each whole image, so a crop of the input gives other exponents than a crop of
+    the output.
+
+    Args:
+        bafe: parameters.
+        attenuation: the rasterized (b1, b2) of Eq. 8.
+    """
+    x = jnp.tanh(attenuation.reshape(-1, *attenuation.shape[-3:]))
+    leaky = lambda y: jax.nn.leaky_relu(y, LEAK)
+    first = leaky(_group_norm(bafe.norm1, _conv(bafe.conv1, x), 2))
+    second = leaky(_group_norm(bafe.norm2, _conv(bafe.conv2, first), 4))
+    third = leaky(_group_norm(bafe.norm3, _conv(bafe.conv3, second), 2) + SKIP_GAIN * first)
+    exponents = EXPONENT_CENTRE + EXPONENT_REACH * jax.nn.soft_sign(_conv(bafe.out, third))
+    return exponents.reshape(attenuation.shape)
+
+
+def _xavier(key: PRNGKeyArray, shape: tuple[int, ...], fan_in: int, fan_out: int) -> Float[Array, "..."]:
     limit = (6 / (fan_in + fan_out)) ** 0.5
     return jax.random.uniform(key, shape, minval=-limit, maxval=limit)
 
 
-def _linear(key, i, o):
-    return Linear(_xavier(key, (i, o), i, o), jnp.zeros(o))
+def _linear(key: PRNGKeyArray, inputs: int, outputs: int) -> Linear:
+    return Linear(_xavier(key, (inputs, outputs), inputs, outputs), jnp.zeros(outputs))
 
 
-def _apply(layer, x):
-    return x @ layer.weight + layer.bias[None]
+def _affine(layer: Linear, x: Float[Array, "*B I"]) -> Float[Array, "*B O"]:
+    flat = x.reshape(-1, x.shape[-1]) @ layer.weight + layer.bias[None]
+    return flat.reshape(*x.shape[:-1], -1)
 
 
-def init_heads(key, feature_size, cfg):
-    keys = iter(jax.random.split(key, 7))
-    h = cfg.hidden
-
-    def head(size):
-        first, last = _linear(next(keys), h, h), _linear(next(keys), h, size)
-        return first, jax.tree.map(jnp.zeros_like, last) if cfg.identity_start else last
-
-    return MotionHeads(_linear(next(keys), feature_size, h), head(3), head(4), head(3))
+def _conv_init(key: PRNGKeyArray, size: int, inputs: int, outputs: int) -> Conv:
+    weight = _xavier(key, (size, size, inputs, outputs), size * size * inputs, size * size * outputs)
+    return Conv(weight, jnp.zeros(outputs))
 
 
-def apply_heads(heads, f):
-    hidden = _apply(heads.aggregate, f)
-    active = jax.nn.relu(hidden)
-    return hidden, *(_apply(last, jax.nn.relu(_apply(first, active))) for first, last in heads[1:])
-
-
-def init_ocd(key, cfg):
-    keys = jax.random.split(key)
-    j = (cfg.sh_degree + 1) ** 2
-    out = _linear(keys[1], cfg.hidden, j)
-    if cfg.identity_start:
-        out = Linear(jnp.zeros_like(out.weight), jnp.ones_like(out.bias))
-    return OCDNet(_linear(keys[0], cfg.hidden, cfg.hidden), out)
-
-
-def apply_ocd(ocd, hidden):
-    return jax.nn.relu(_apply(ocd.out, jax.nn.elu(_apply(ocd.hidden, jax.nn.elu(hidden)))))
-
-
-def init_bafe(key, cfg):
-    keys = jax.random.split(key, 4)
-    conv = lambda k, s, i, o: Conv(_xavier(k, (s, s, i, o), s * s * i, s * s * o), jnp.zeros(o))
-    norm = lambda c: GroupNorm(jnp.ones(c), jnp.zeros(c))
-    out = conv(keys[3], 1, 8, 2)
-    if cfg.initial_exponents is not None:
-        y = (jnp.array(cfg.initial_exponents) - 5.5) / 4.5
-        out = Conv(jnp.zeros_like(out.weight), y / (1 - jnp.abs(y)))
-    return BAFENet(conv(keys[0], 5, 2, 8), norm(8), conv(keys[1], 3, 8, 16), norm(16), conv(keys[2], 3, 16, 8), norm(8), out)
-
-
-def _conv(layer, x):
-    y = jax.lax.conv_general_dilated(x, layer.weight, (1, 1), "SAME", dimension_numbers=("NHWC", "HWIO", "NHWC"))
+def _conv(layer: Conv, x: Float[Array, "B H W I"]) -> Float[Array, "B H W O"]:
+    """Convolution with zero padding that keeps the size."""
+    layout = ("NHWC", "HWIO", "NHWC")
+    y = jax.lax.conv_general_dilated(x, layer.weight, (1, 1), "SAME", dimension_numbers=layout)
     return y + layer.bias[None, None, None]
 
 
-def _norm(layer, x, groups):
-    b, h, w, c = x.shape
-    g = x.reshape(b, h, w, groups, c // groups)
-    m = g.mean((1, 2, 4), keepdims=True)
-    v = jnp.square(g - m).mean((1, 2, 4), keepdims=True)
-    g = ((g - m) / jnp.sqrt(v + 1e-5)).reshape(b, h, w, c)
-    return g * layer.scale[None, None, None] + layer.bias[None, None, None]
+def _group_norm(layer: GroupNorm, x: Float[Array, "B H W C"], groups: int) -> Float[Array, "B H W C"]:
+    """Zero mean and unit variance over each image and group of channels, then an affine map a channel."""
+    grouped = x.reshape(*x.shape[:3], groups, -1)
+    centred = grouped - grouped.mean((1, 2, 4), keepdims=True)
+    variance = jnp.square(centred).mean((1, 2, 4), keepdims=True)
+    normal = (centred * jax.lax.rsqrt(variance + GROUP_NORM_EPS)).reshape(x.shape)
+    return normal * layer.scale[None, None, None] + layer.bias[None, None, None]
 
 
-def apply_bafe(bafe, attenuation):
-    lead = attenuation.shape[:-3]
-    x = jnp.tanh(attenuation.reshape(-1, *attenuation.shape[-3:]))
-    act = lambda v: jax.nn.leaky_relu(v, 0.01)
-    x1 = act(_norm(bafe.norm1, _conv(bafe.conv1, x), 2))
-    x2 = act(_norm(bafe.norm2, _conv(bafe.conv2, x1), 4))
-    x3 = act(_norm(bafe.norm3, _conv(bafe.conv3, x2), 2) + 0.3 * x1)
-    out = 4.5 * jax.nn.soft_sign(_conv(bafe.out, x3)) + 5.5
-    return out.reshape(*lead, *out.shape[-3:])
+def _exponent_inverse(exponent: float | str) -> float:
+    """What the last layer must give for `exponent` to come out."""
+    if isinstance(exponent, str) or not abs(exponent - EXPONENT_CENTRE) < EXPONENT_REACH:
+        raise ValueError(f"initial exponents must be numbers strictly between 1 and 10, not {exponent}")
+    sign = (exponent - EXPONENT_CENTRE) / EXPONENT_REACH
+    return sign / (1 - abs(sign))
