@@ -29,8 +29,8 @@ VIDEO_RATE = 24  # frames a second
 def contact_sheet(run: Run, rows: int = 4) -> UInt8[np.ndarray, "H W 3"]:
     """Pictures of a few instants, one row each, in the columns of `COLUMNS`; the truth only where there is one.
 
-    L and R are shown as they are. B1, B2 and depth are coloured (viridis) over the range that their heading states,
-    the same in all rows; the depth's range goes from its 2nd to its 98th percentile.
+    L and R are shown as they are. B1, B2 and depth are coloured (viridis) from their 2nd to their 98th percentile over
+    all rows, the range that their heading states.
 
     Args:
         run: the run.
@@ -40,17 +40,14 @@ def contact_sheet(run: Run, rows: int = 4) -> UInt8[np.ndarray, "H W 3"]:
     held_out = len(dataset.test.names) > 0
     split = dataset.test if held_out else dataset.train
     in_time = np.argsort(split.cameras.time, kind="stable")
-    chosen = in_time[np.unique(np.linspace(0, len(in_time) - 1, rows).round().astype(int))]
+    chosen = in_time[np.unique(np.linspace(0, len(in_time) - 1, rows).round().astype(int))].tolist()
     renderer = run.renderer()
     outputs = [jax.device_get(renderer(view(split.cameras, i))) for i in chosen]
 
     exponents = np.stack([output.images.attenuation for output in outputs])
     depths = np.stack([expected_depth(output) for output in outputs])
-    ranges = {
-        "B1": (exponents[..., 0].min(), exponents[..., 0].max()),
-        "B2": (exponents[..., 1].min(), exponents[..., 1].max()),
-        "depth": tuple(np.percentile(depths, (2, 98))),
-    }
+    coloured = {"B1": exponents[..., 0], "B2": exponents[..., 1], "depth": depths}
+    ranges = {name: np.percentile(values, (2, 98)) for name, values in coloured.items()}
     columns = [name for name in COLUMNS if name != "truth" or split.welllit is not None]
     headings = [f"{name} {ranges[name][0]:.4g}-{ranges[name][1]:.4g}" if name in ranges else name for name in columns]
 
@@ -63,10 +60,7 @@ def contact_sheet(run: Run, rows: int = 4) -> UInt8[np.ndarray, "H W 3"]:
             "well-lit": to_bytes(images.welllit),
             "L": to_bytes(np.repeat(images.illumination[..., None], 3, axis=-1)),
             "R": to_bytes(images.reflectance),
-            "B1": viridis(exponents[row, ..., 0], *ranges["B1"]),
-            "B2": viridis(exponents[row, ..., 1], *ranges["B2"]),
-            "depth": viridis(depths[row], *ranges["depth"]),
-        }
+        } | {name: viridis(values[row], *ranges[name]) for name, values in coloured.items()}
         if split.welllit is not None:
             pictures["truth"] = to_bytes(split.welllit[i])
         cells = np.hstack([np.pad(_cell(pictures[name]), ((0, GAP), (0, GAP), (0, 0))) for name in columns])
