@@ -279,10 +279,10 @@ def test_gradients_of_the_total(cfg):
     grads_agree(objective, render.images, render.depth)
 
 
-@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 @pytest.mark.parametrize("cfg", [EVERY_TERM, AUTHORS], ids=["every term", "authors"])
 @pytest.mark.parametrize("size", [(1, 1), (1, 6), (5, 4)], ids=str)
-def test_extremes_are_finite(cfg, size, dtype):
+def test_extremes_are_finite_in_single_precision(cfg, size):
+    dtype = jnp.float32
     for level, eta, goal in itertools.product((0.0, 1.0), (0.95, 0.5), (0.0, 1.0)):
         render = constant_render(level, *size, dtype)
         target = jnp.full((1, *size, 3), goal, dtype)
