@@ -180,6 +180,7 @@ def initial_state(dataset: Dataset, config: Config) -> TrainState:
     return begin_stage(scene, jnp.zeros((), jnp.int32), config, config.coarse_steps)
 
 
+@partial(jax.jit, static_argnames=("config", "stage_steps"))
 def begin_stage(scene: Scene, step: Int[Array, ""], config: Config, stage_steps: int) -> TrainState:
     """A state with fresh optimizer moments, schedules and statistics, as 4DGS starts each stage."""
     rates = optim.schedules(config.optim, scene.extent, stage_steps)

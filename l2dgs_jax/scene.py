@@ -1,5 +1,7 @@
 """A scene's initial state, its capacity, and the names of its parameter groups."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -43,7 +45,8 @@ def initialise(
     """A scene with one Gaussian a point, ready for training.
 
     Scales are the root mean square distance to the three nearest points, illumination the luminance of the point
-    (mid-grey without colours) unless `cfg.initial_illumination` says otherwise, opacity `cfg.initial_opacity`, reflectance and attenuation random (paper, section 4).
+    (mid-grey without colours) unless `cfg.initial_illumination` says otherwise, opacity `cfg.initial_opacity`,
+    reflectance and attenuation random (paper, section 4).
 
     Args:
         key: randomness of reflectance, attenuation, planes and networks.
@@ -54,31 +57,51 @@ def initialise(
         capacity: rows to allocate; those past P are dead.
     """
     count = len(points)
-    keys = jax.random.split(key, 6)
-    pad = lambda x: jnp.pad(jnp.asarray(x, float), [(0, capacity - count)] + [(0, 0)] * (np.ndim(x) - 1))
-
     distances, _ = cKDTree(points).query(points, k=min(4, count))
     mean_square = np.square(distances[:, 1:]).mean(-1) if count > 1 else np.ones(count)
     if cfg.initial_illumination is not None:
         illumination = np.full(count, cfg.initial_illumination)
     else:
         illumination = np.full(count, 0.5) if colors is None else np.asarray(colors) @ LUMINANCE
-    random = {"normal": jax.random.normal, "uniform": jax.random.uniform}
-    coefficients = (cfg.sh_degree + 1) ** 2
+    return _initialise(
+        key,
+        jnp.asarray(points, float),
+        jnp.asarray(0.5 * np.log(np.maximum(mean_square, 1e-7)), float),
+        jnp.asarray(illumination, float),
+        jnp.asarray(camera_extent(cameras), float),
+        cfg,
+        len(cameras.time),
+        capacity,
+    )
 
+
+@partial(jax.jit, static_argnames=("cfg", "num_frames", "capacity"))
+def _initialise(
+    key: PRNGKeyArray,
+    points: Float[Array, "P 3"],
+    log_scales: Float[Array, " P"],
+    illumination: Float[Array, " P"],
+    extent: Float[Array, ""],
+    cfg: ModelConfig,
+    num_frames: int,
+    capacity: int,
+) -> Scene:
+    count = len(points)
+    keys = jax.random.split(key, 6)
+    random = {"normal": jax.random.normal, "uniform": jax.random.uniform}
     gaussians = Gaussians(
-        means=pad(points),
-        quats=pad(np.tile([1.0, 0.0, 0.0, 0.0], (count, 1))),
-        log_scales=pad(np.tile(0.5 * np.log(np.maximum(mean_square, 1e-7))[:, None], 3)),
-        logit_opacities=pad(np.full(count, np.log(cfg.initial_opacity / (1 - cfg.initial_opacity)))),
-        illumination_dc=pad((illumination - cfg.illumination_offset)[:, None] / SH_DC),
-        illumination_rest=jnp.zeros((capacity, coefficients - 1)),
-        reflectance=pad(random[cfg.reflectance_init](keys[0], (count, 3))),
-        attenuation=pad(random[cfg.attenuation_init](keys[1], (count, 2))),
+        means=points,
+        quats=jnp.tile(jnp.array([[1.0, 0.0, 0.0, 0.0]]), (count, 1)),
+        log_scales=jnp.tile(log_scales[:, None], (1, 3)),
+        logit_opacities=jnp.full(count, jax.scipy.special.logit(cfg.initial_opacity)),
+        illumination_dc=(illumination - cfg.illumination_offset)[:, None] / SH_DC,
+        illumination_rest=jnp.zeros((count, (cfg.sh_degree + 1) ** 2 - 1)),
+        reflectance=random[cfg.reflectance_init](keys[0], (count, 3)),
+        attenuation=random[cfg.attenuation_init](keys[1], (count, 2)),
     )
     params = SceneParams(
-        gaussians=gaussians,
-        hexplane=hexplane.init(keys[2], cfg, len(cameras.time)),
+        gaussians=jax.tree.map(lambda rows: pad_rows(rows, capacity), gaussians),
+        hexplane=hexplane.init(keys[2], cfg, num_frames),
         heads=networks.init_heads(keys[3], cfg.plane_channels * len(cfg.plane_scales), cfg),
         ocd=networks.init_ocd(keys[4], cfg),
         bafe=networks.init_bafe(keys[5], cfg),
@@ -86,8 +109,8 @@ def initialise(
     return Scene(
         params=params,
         alive=jnp.arange(capacity) < count,
-        bounds=jnp.asarray(np.stack([points.min(0), points.max(0)]), float),
-        extent=jnp.asarray(camera_extent(cameras), float),
+        bounds=jnp.stack([points.min(0), points.max(0)]),
+        extent=extent,
     )
 
 
