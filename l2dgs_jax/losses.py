@@ -135,14 +135,13 @@ def depth_smoothness(
         gradient: forward differences, or unnormalised 3x3 Sobel filters with zeros beyond the image (the authors').
             The image's is the mean over channels of absolute values.
     """
+
+    def smoothness(step: Float[Array, "..."], edge: Float[Array, "..."]) -> Scalar:
+        return _mean(jnp.abs(step) * jnp.exp(-jnp.abs(edge).mean(-1, keepdims=True)))
+
     differences = _forward if gradient == "forward" else _sobel
-    return sum(
-        (
-            _mean(jnp.abs(step) * jnp.exp(-jnp.abs(edge).mean(-1, keepdims=True)))
-            for step, edge in zip(differences(depth[..., None]), differences(image), strict=True)
-        ),
-        start=jnp.zeros((), depth.dtype),
-    )
+    (depth_x, depth_y), (image_x, image_y) = differences(depth[..., None]), differences(image)
+    return smoothness(depth_x, image_x) + smoothness(depth_y, image_y)
 
 
 def amplification(illumination: Float[Array, "*B H W"]) -> Scalar:
@@ -167,10 +166,8 @@ def structure(
     """
     if gradient == "magnitude":
         return jnp.abs(beta * _magnitude(exponent) - _magnitude(guide)).mean()
-    return sum(
-        (_mean(jnp.abs(beta * b - g)) for b, g in zip(_forward(exponent), _forward(guide), strict=True)),
-        start=jnp.zeros((), guide.dtype),
-    )
+    (exponent_x, exponent_y), (guide_x, guide_y) = _forward(exponent), _forward(guide)
+    return _mean(jnp.abs(beta * exponent_x - guide_x)) + _mean(jnp.abs(beta * exponent_y - guide_y))
 
 
 def total_variation(image: Float[Array, "*B H W"]) -> Scalar:
