@@ -104,9 +104,9 @@ def table(result: dict) -> str:
         rows.append(("dark frame x gain", result["dark_frame_gain"]))
     lines = [f"{result['frames']} {result['split']} views, {result['stage']} stage, step {result['step']}"]
     lines.append(f"{'':18}{'PSNR':>8}{'SSIM':>8}{'PSNR, gain':>13}{'SSIM, gain':>13}")
+    formats = (("psnr", 8, "8.2f"), ("ssim", 8, "8.3f"), ("psnr_gain", 13, "13.2f"), ("ssim_gain", 13, "13.3f"))
     for name, scores in rows:
-        formats = (("psnr", "8.2f"), ("ssim", "8.3f"), ("psnr_gain", "13.2f"), ("ssim_gain", "13.3f"))
-        cells = (format(scores[key], form) if key in scores else " " * int(form.split(".")[0]) for key, form in formats)
+        cells = [format(scores[key], form) if key in scores else " " * width for key, width, form in formats]
         lines.append(f"{name:18}{''.join(cells)}".rstrip())
     if "gain" in result:
         lines.append(f"gain {result['gain']:.3f}, of the dark frame {result['dark_frame_gain']['gain']:.3f}")

@@ -9,7 +9,7 @@ from typing import Any
 import cv2
 import jax
 import numpy as np
-import OpenImageIO as oiio
+import OpenImageIO as oiio  # noqa: N813
 from jaxtyping import Float, Shaped, UInt8
 from scipy.spatial.transform import Rotation
 from tqdm import tqdm

@@ -2,6 +2,9 @@
 
 import dataclasses
 import json
+import os
+import subprocess
+import sys
 
 import finished_run
 import numpy as np
@@ -165,6 +168,19 @@ def test_command_scores_the_coarse_stage_and_the_training_views(base, result, tm
     assert coarse["frames"] == finished_run.FRAMES - len(finished_run.HELD_OUT)
     assert coarse["lowlight"] != result["lowlight"]
     assert "8 train views, coarse stage, step 3" in capsys.readouterr().out
+
+
+def test_a_process_of_its_own_in_single_precision_finds_the_same(base, result, tmp_path):
+    file = tmp_path / "scores.json"
+    command = [sys.executable, "-m", "l2dgs_jax.evaluate", str(finished_run.folder(base)), "--json", str(file)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, env=os.environ | {"JAX_ENABLE_X64": "0"})
+    assert done.stdout.startswith("2 test views")
+    single = json.loads(file.read_text())
+    for scores, expected in (
+        (single["lowlight"], result["lowlight"]),
+        (single["welllit"]["overall"], result["welllit"]["overall"]),
+    ):
+        assert scores == pytest.approx(expected, abs=0.02)
 
 
 @pytest.mark.parametrize(
