@@ -38,7 +38,7 @@ def basis(directions: Float[Array, "*B N 3"], degree: int) -> Float[Array, "*B N
         raise ValueError(f"the degree of spherical harmonics must be at least 0, not {degree}")
     x, y, z = directions[..., 0], directions[..., 1], directions[..., 2]
     bands: dict[tuple[int, int], Array] = {}
-    # (x + iy)^m = sin^m(theta) (cos(m phi) + i sin(m phi)); `legendre[l]` is P_l^m(z) / sin^m(theta), a polynomial in z.
+    # (x + iy)^m = sin^m(theta) (cos(m phi) + i sin(m phi)); `legendre[l]` is P_l^m(z) / sin^m(theta).
     cosine, sine = jnp.ones_like(z), jnp.zeros_like(z)
     diagonal = 1.0
     for m in range(degree + 1):

@@ -51,25 +51,42 @@ def _pixels(dtype) -> Float[Array, "P 2"]:
     return jnp.stack(jnp.meshgrid(offset, offset), axis=-1).reshape(PIXELS, 2)
 
 
-def _chunk(
-    packed: Float[Array, "G D"], lists: TileLists, block: _Block, step: Int[Array, ""] | int
-) -> tuple[Int[Array, "K B"], Float[Array, "K B D"], Float[Array, "K B P"]]:
-    """The next CHUNK Gaussians of each list of a block: ids, values with means from the tile's middle, and alphas."""
-    index = block.starts[None] + step * CHUNK + jnp.arange(CHUNK, dtype=jnp.int32)[:, None]
-    listed = index < block.stops[None]
-    ids = lists.gaussians[jnp.minimum(index, lists.gaussians.shape[0] - 1)]
-    values = packed[ids]
-    values = values.at[..., :2].add(-block.centres[None])
-    mx, my, a, b, c, opacity = (values[..., column, None] for column in range(GEOMETRY))
-    x, y = (axis[None, None] for axis in _pixels(packed.dtype).T)
-    dx, dy = x - mx, y - my
-    alpha = jnp.where(listed[..., None], opacity, 0) * jnp.exp(-(0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy))
-    return ids, values, jnp.where(alpha < MIN_ALPHA, 0, jnp.minimum(alpha, MAX_ALPHA))
+def _alpha(value: Float[Array, "B D"], pixels: Float[Array, "P 2"]) -> Float[Array, "B P"]:
+    """Opacity of one Gaussian per tile at each pixel; exactly zero below MIN_ALPHA."""
+    mx, my, a, b, c, opacity = (value[:, column, None] for column in range(GEOMETRY))
+    dx, dy = pixels[None, :, 0] - mx, pixels[None, :, 1] - my
+    alpha = opacity * jnp.exp(-(0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy))
+    return jnp.where(alpha < MIN_ALPHA, 0, jnp.minimum(alpha, MAX_ALPHA))
 
 
-def _unfinished(block: _Block, step: Int[Array, ""] | int, transmittance: Float[Array, "B P"]):
-    listed = step * CHUNK < jnp.max(block.stops - block.starts)
-    return listed & ~jnp.all(transmittance <= MIN_TRANSMITTANCE)
+def _walk(packed, lists, block, blend, state, gather=None):
+    """Walk the lists of a block front to back until they end or every pixel has.
+
+    Args:
+        packed: see `composite`.
+        lists: see `composite`.
+        block: the tiles.
+        blend: (state, values [B D]) -> (state, update), for one Gaussian per tile, means measured from the tile's
+            middle. `state[0]` is the transmittance.
+        state: what it starts from.
+        gather: the sum of each Gaussian's updates so far, [G D]; None if there are no updates.
+    """
+    longest = jnp.max(block.stops - block.starts)
+
+    def unfinished(carry):
+        step, (transmittance, *_), _ = carry
+        return (step * CHUNK < longest) & ~jnp.all(transmittance <= MIN_TRANSMITTANCE)
+
+    def body(carry):
+        step, state, gather = carry
+        index = block.starts[None] + step * CHUNK + jnp.arange(CHUNK, dtype=jnp.int32)[:, None]
+        ids = lists.gaussians[jnp.minimum(index, lists.gaussians.shape[0] - 1)]
+        values = packed[ids].at[..., :2].add(-block.centres[None])
+        values = jnp.where((index < block.stops[None])[..., None], values, 0)
+        state, updates = jax.lax.scan(blend, state, values)
+        return step + 1, state, None if gather is None else gather.at[ids].add(updates)
+
+    return jax.lax.while_loop(unfinished, body, (0, state, gather))[1:]
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(2, 3))
@@ -90,25 +107,22 @@ def composite(packed: Float[Array, "G D"], lists: TileLists, width: int, height:
 
 def _forward(packed, lists, width, height):
     blocks, position = _blocks(lists, width, height, packed.dtype)
+    pixels = _pixels(packed.dtype)
     channels = packed.shape[1] - GEOMETRY
 
-    def blend(block):
-        def body(state):
-            step, transmittance, total = state
-            _, values, alphas = _chunk(packed, lists, block, step)
-            # Unrolled, this fuses into one pass over the chunk; a scan or a matrix product would write it to memory.
-            for value, alpha in zip(values, alphas, strict=True):
-                after = transmittance * (1 - alpha)
-                weight = jnp.where(after <= MIN_TRANSMITTANCE, 0, transmittance * alpha)
-                total = total + value[:, GEOMETRY:, None] * weight[:, None]
-                transmittance = after
-            return step + 1, transmittance, total
+    def blend(state, value):
+        transmittance, total = state
+        alpha = _alpha(value, pixels)
+        after = transmittance * (1 - alpha)
+        weight = jnp.where(after <= MIN_TRANSMITTANCE, 0, transmittance * alpha)
+        return (after, total + value[:, GEOMETRY:, None] * weight[:, None]), None
 
-        size = block.tiles.shape[0]
-        state = 0, jnp.ones((size, PIXELS), packed.dtype), jnp.zeros((size, channels, PIXELS), packed.dtype)
-        return jax.lax.while_loop(lambda s: _unfinished(block, s[0], s[1]), body, state)[2]
+    def draw(block):
+        start = jnp.ones((block.tiles.shape[0], PIXELS), packed.dtype)
+        total = jnp.zeros((block.tiles.shape[0], channels, PIXELS), packed.dtype)
+        return _walk(packed, lists, block, blend, (start, total))[0][1]
 
-    output = jax.lax.map(blend, blocks).reshape(-1, channels, PIXELS)[position]
+    output = jax.lax.map(draw, blocks).reshape(-1, channels, PIXELS)[position]
     return output, (packed, lists, output)
 
 
@@ -116,47 +130,42 @@ def _backward(width, height, residuals, cotangent):
     packed, lists, output = residuals
     blocks, _ = _blocks(lists, width, height, packed.dtype)
     pixels = _pixels(packed.dtype)
-    x, y = pixels[:, 0], pixels[:, 1]
-    moments = jnp.stack([jnp.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
+    x, y = pixels.T
+    monomials = jnp.stack([jnp.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
 
-    def blend(gradient, block):
+    def draw(gradient, block):
         g = cotangent[block.tiles]
 
-        def passing(state, inputs):
+        def blend(state, value):
             transmittance, behind = state
-            alpha, value = inputs
+            alpha = _alpha(value, pixels)
             after = transmittance * (1 - alpha)
             ended = after <= MIN_TRANSMITTANCE
             weight = jnp.where(ended, 0, transmittance * alpha)
-            behind = behind - weight * value
-            d_alpha = transmittance * value - behind / (1 - alpha)
-            return (after, behind), (weight, jnp.where(ended | (alpha >= MAX_ALPHA), 0, -d_alpha * alpha))
+            seen = jnp.sum(value[:, GEOMETRY:, None] * g, axis=1)
+            # What the pixel's output owes to the Gaussians behind this one scales with 1 - alpha.
+            behind = behind - weight * seen
+            d_alpha = transmittance * seen - behind / (1 - alpha)
+            d_sigma = jnp.where(ended | (alpha >= MAX_ALPHA), 0, -d_alpha * alpha)
 
-        def body(state):
-            step, transmittance, behind, gradient = state
-            ids, values, alphas = _chunk(packed, lists, block, step)
-            value = sum(values[..., GEOMETRY + c, None] * g[None, :, c] for c in range(g.shape[1]))
-            (transmittance, behind), (weight, d_sigma) = jax.lax.scan(passing, (transmittance, behind), (alphas, value))
-
-            mx, my, a, b, c, opacity = (values[..., column] for column in range(GEOMETRY))
-            m, m_x, m_y, m_xx, m_xy, m_yy = jnp.moveaxis(d_sigma @ moments, -1, 0)
-            sx, sy = m_x - mx * m, m_y - my * m
+            mx, my, a, b, c, opacity = (value[:, column] for column in range(GEOMETRY))
+            m, m_x, m_y, m_xx, m_xy, m_yy = (d_sigma @ monomials).T
+            s_x, s_y = m_x - mx * m, m_y - my * m
             geometry = [
-                -(a * sx + b * sy),
-                -(b * sx + c * sy),
-                0.5 * (m_xx - mx * (m_x + sx)),
-                m_xy - mx * m_y - my * sx,
-                0.5 * (m_yy - my * (m_y + sy)),
+                -(a * s_x + b * s_y),
+                -(b * s_x + c * s_y),
+                0.5 * (m_xx - mx * (m_x + s_x)),
+                m_xy - mx * m_y - my * s_x,
+                0.5 * (m_yy - my * (m_y + s_y)),
                 -m / jnp.where(opacity == 0, 1, opacity),
             ]
-            update = [jnp.stack(geometry, axis=-1), jnp.einsum("kbp,bcp->kbc", weight, g)]
-            return step + 1, transmittance, behind, gradient.at[ids].add(jnp.concatenate(update, axis=-1))
+            features = jnp.einsum("bp,bcp->bc", weight, g)
+            return (after, behind), jnp.concatenate([jnp.stack(geometry, axis=-1), features], axis=-1)
 
         behind = jnp.sum(output[block.tiles] * g, axis=1)
-        state = 0, jnp.ones_like(behind), behind, gradient
-        return jax.lax.while_loop(lambda s: _unfinished(block, s[0], s[1]), body, state)[3], None
+        return _walk(packed, lists, block, blend, (jnp.ones_like(behind), behind), gradient)[1], None
 
-    gradient, _ = jax.lax.scan(blend, jnp.zeros_like(packed), blocks)
+    gradient, _ = jax.lax.scan(draw, jnp.zeros_like(packed), blocks)
     return gradient, jax.tree.map(lambda x: np.zeros(x.shape, jax.dtypes.float0), lists)
 
 
