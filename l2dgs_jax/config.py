@@ -161,7 +161,16 @@ def _presets() -> dict[str, Config]:
         optim=OptimConfig(extent_scales=("means", "heads", "planes", "ocd", "bafe")),
     )
     default = Config(
-        model=ModelConfig(identity_start=True, initial_exponents=("auto", 9.0), initial_illumination="auto"),
+        coarse_steps=600,
+        fine_steps=2400,
+        sh_warmup=300,
+        model=ModelConfig(
+            identity_start=True,
+            hidden=64,
+            plane_scales=(1, 2),
+            initial_exponents=("auto", 9.0),
+            initial_illumination="auto",
+        ),
         loss=LossConfig(
             exposure=1.0,
             exposure_level=0.46,

@@ -16,7 +16,7 @@ SH_DC = 0.28209479177387814  # value of the first SH basis function
 LUMINANCE = np.array([0.2989, 0.587, 0.114])
 
 
-def rung(count: float, *, base: int = 1024) -> int:
+def rung(count: float | int, *, base: int = 1024) -> int:
     """The smallest size >= `count` on the ladder base, 1.5 base, 1.5^2 base ... (multiples of 256).
 
     Static sizes are taken from it, so that growing work recompiles a logarithmic number of times.
@@ -93,7 +93,7 @@ def _initialise(
         means=points,
         quats=jnp.tile(jnp.array([[1.0, 0.0, 0.0, 0.0]]), (count, 1)),
         log_scales=jnp.tile(log_scales[:, None], (1, 3)),
-        logit_opacities=jnp.full(count, jax.scipy.special.logit(cfg.initial_opacity)),
+        logit_opacities=jnp.full(count, jax.scipy.special.logit(cfg.initial_opacity), points.dtype),
         illumination_dc=(illumination - cfg.illumination_offset)[:, None] / SH_DC,
         illumination_rest=jnp.zeros((count, (cfg.sh_degree + 1) ** 2 - 1)),
         reflectance=random[cfg.reflectance_init](keys[0], (count, 3)),

@@ -150,6 +150,13 @@ def test_a_resumed_run_equals_the_uninterrupted_one(dataset, finished, tmp_path)
         assert_equal_states(finish(dataset, config, state, pair_capacity).state, finished.state)
 
 
+def test_a_stage_compiles_once(dataset):
+    config = tiny(density=DensityConfig(start=1000))
+    compiled = engine.train_step._cache_size()
+    finish(dataset, config, pair_capacity=8192)
+    assert engine.train_step._cache_size() == compiled + 2
+
+
 def test_a_small_pair_buffer_grows_and_changes_nothing(dataset, finished):
     small = finish(dataset, tiny(), pair_capacity=8)
     assert small.pair_capacity > 8

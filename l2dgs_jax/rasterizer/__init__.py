@@ -70,8 +70,7 @@ def rasterize(
 
 
 def _prepare(means, quats, scales, opacities, viewmat, K, probe, width, height) -> tuple[Projected, Footprints]:
-    view = lambda *arrays: project(*arrays, width, height)
-    projected = jax.vmap(view)(means, quats, scales, viewmat, K)
+    projected = jax.vmap(partial(project, width=width, height=height))(means, quats, scales, viewmat, K)
     if probe is not None:
         projected = projected._replace(means2d=projected.means2d + probe)
     return projected, footprints(*jax.lax.stop_gradient((projected, opacities)), width, height)
