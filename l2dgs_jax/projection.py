@@ -31,8 +31,8 @@ class Projected(NamedTuple):
 def rotations(quats: Float[Array, "*B N 4"]) -> Float[Array, "N 3 3"]:
     """Rotation matrices of quaternions (wxyz) of any norm; a zero quaternion is the identity and has no gradient."""
     squared = jnp.sum(quats**2, axis=-1, keepdims=True)
-    proper = squared > 1e-24
-    unit = jnp.where(proper, quats / jnp.sqrt(jnp.where(proper, squared, 1)), 0)
+    zero = squared <= 1e-24
+    unit = jnp.where(zero, 0, quats / jnp.sqrt(jnp.where(zero, 1, squared)))
     w, x, y, z = unit[:, 0], unit[:, 1], unit[:, 2], unit[:, 3]
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],

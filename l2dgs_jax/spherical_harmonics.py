@@ -17,8 +17,8 @@ def directions(means: Float[Array, "*B N 3"], camera_centre: Float[Array, "*B 3"
     """
     offsets = means - camera_centre[..., None, :]
     squared = jnp.sum(offsets**2, axis=-1, keepdims=True)
-    apart = squared > 0
-    return jnp.where(apart, offsets / jnp.sqrt(jnp.where(apart, squared, 1)), 0)
+    coincident = squared == 0
+    return jnp.where(coincident, 0, offsets / jnp.sqrt(jnp.where(coincident, 1, squared)))
 
 
 def basis(directions: Float[Array, "*B N 3"], degree: int) -> Float[Array, "*B N J"]:

@@ -1,0 +1,235 @@
+from functools import partial
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.test_util import check_grads
+
+from l2dgs_jax.rasterizer import rasterize
+from l2dgs_jax.rasterizer.intersect import _sorted
+from l2dgs_jax.rasterizer.reference import rasterize_dense
+
+GOLDEN = Path(__file__).parent / "golden"
+NAMES = ("means", "quats", "scales", "opacities", "features", "viewmat", "K")
+WIDTH, HEIGHT, CAPACITY = 21, 13, 512
+
+
+def scene(seed=0, count=40, width=WIDTH, height=HEIGHT):
+    """Random Gaussians in front of a camera, opaque enough that some pixels end early."""
+    random = np.random.default_rng(seed)
+    z = random.uniform(2, 5, count)
+    means = np.stack([random.uniform(-0.6, 0.6, count) * z, random.uniform(-0.4, 0.4, count) * z, z], axis=-1)
+    viewmat = np.eye(4)
+    viewmat[:3, 3] = [0.1, -0.05, 0.2]
+    arrays = (
+        means,
+        random.normal(size=(count, 4)),
+        np.exp(random.normal(np.log(0.25), 0.4, (count, 3))),
+        random.uniform(0.05, 1, count),
+        random.uniform(size=(count, 2)),
+        viewmat,
+        np.array([[width, 0, width / 2], [0, width, height / 2], [0, 0, 1.0]]),
+    )
+    return tuple(jnp.asarray(x) for x in arrays)
+
+
+def stacked(seeds):
+    return tuple(jnp.stack(x) for x in zip(*(scene(seed) for seed in seeds), strict=True))
+
+
+capped = partial(rasterize, pair_capacity=CAPACITY)
+
+
+def images(*arrays, draw=capped, width=WIDTH, height=HEIGHT):
+    output = draw(*arrays, width, height)
+    return (output.features, output.alpha, output.depth) if draw is not rasterize_dense else output
+
+
+def weigh(values, seed=9):
+    """A loss that sees every entry differently."""
+    random = np.random.default_rng(seed)
+    return sum(jnp.sum(x * random.normal(size=x.shape).astype(x.dtype)) for x in values)
+
+
+@jax.jit
+def fast(*arrays):
+    """Images and gradients of the loss, one view."""
+    loss = lambda *a: (weigh(values := images(*a)), values)
+    (_, values), gradients = jax.value_and_grad(loss, tuple(range(7)), has_aux=True)(*arrays)
+    return values, gradients
+
+
+def assert_close(actual, expected, tolerance=1e-9):
+    for a, e in zip(actual, expected, strict=True):
+        assert a.shape == e.shape
+        assert np.linalg.norm(a - e) <= tolerance * np.linalg.norm(e)
+
+
+@pytest.mark.parametrize("name", ["s500_96x64", "s500o_96x64", "s2000_160x96"])
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_golden_scenes(name, dtype):
+    golden = np.load(GOLDEN / f"{name}.npz")
+    arrays = [jnp.asarray(golden[f"in_{key}"], dtype) for key in NAMES]
+    weights = [jnp.asarray(golden[f"in_w_{key}"], dtype) for key in ("features", "alpha", "depth")]
+    width, height = int(golden["in_width"]), int(golden["in_height"])
+
+    def loss(probe, *arrays):
+        output = rasterize(*arrays, width, height, means2d_probe=probe)
+        drawn = output.features, output.alpha, output.depth
+        return sum(jnp.sum(w * x) for w, x in zip(weights, drawn, strict=True)), output
+
+    probe = jnp.zeros((len(arrays[0]), 2), dtype)
+    (_, output), gradients = jax.value_and_grad(loss, tuple(range(8)), has_aux=True)(probe, *arrays)
+    clear = ~golden["out_ambiguous"]
+    assert clear.mean() > 0.95
+    for actual, key in ((output.features, "features"), (output.alpha, "alpha"), (output.depth, "depth_acc")):
+        assert actual.dtype == dtype
+        np.testing.assert_allclose(np.asarray(actual)[clear], golden[f"out_{key}"][clear], rtol=0, atol=1e-5)
+    for gradient, key in zip(gradients, ("means2d", *NAMES), strict=True):
+        expected = golden[f"out_g_{key}"]
+        assert gradient.dtype == dtype
+        assert np.linalg.norm(gradient - expected) <= 1e-4 * np.linalg.norm(expected), key
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_agrees_with_the_dense_oracle(seed):
+    arrays = scene(seed)
+    dense = partial(images, draw=rasterize_dense)
+    values, gradients = fast(*arrays)
+    assert_close(values, dense(*arrays))
+    assert_close(gradients, jax.grad(lambda *a: weigh(dense(*a)), tuple(range(7)))(*arrays))
+    assert values[1].max() > 0.999  # the rule that ends a pixel was exercised
+
+
+@pytest.mark.parametrize(("width", "height"), [(1, 1), (8, 8), (3, 17)])
+def test_image_sizes(width, height):
+    arrays = scene(4, width=width, height=height)
+    drawn = rasterize(*arrays, width, height)
+    expected = rasterize_dense(*arrays, width, height)
+    assert drawn.alpha.shape == (height, width)
+    assert_close((drawn.features, drawn.alpha, drawn.depth), expected)
+    gradient = jax.grad(lambda *a: weigh(images(*a, draw=rasterize, width=width, height=height)), tuple(range(7)))
+    expected = jax.grad(lambda *a: weigh(images(*a, draw=rasterize_dense, width=width, height=height)), tuple(range(7)))
+    assert_close(gradient(*arrays), expected(*arrays))
+
+
+def test_numerical_gradients():
+    # Wide, faint, few: no contribution is near a threshold, where the image jumps.
+    means, quats, scales, _, features, viewmat, K = (x[:3] if i < 5 else x for i, x in enumerate(scene(7)))
+    arrays = means * jnp.array([0.1, 0.1, 1.0])[None], quats, 4 + scales, jnp.array([0.3, 0.5, 0.4]), features
+    check_grads(
+        jax.jit(lambda *a: images(*a, viewmat, K, width=9, height=5)), arrays, order=1, modes=("rev",), eps=1e-5
+    )
+
+
+def test_views_fold_into_one_render():
+    arrays = stacked(range(3))
+    loss = lambda *a: (weigh(values := images(*a)), values)
+    (_, together), gradients = jax.jit(jax.value_and_grad(loss, tuple(range(7)), has_aux=True))(*arrays)
+
+    def looped(*a):
+        values = tuple(jnp.stack(x) for x in zip(*(images(*(x[v] for x in a)) for v in range(3)), strict=True))
+        return weigh(values), values
+
+    (_, apart), expected = jax.jit(jax.value_and_grad(looped, tuple(range(7)), has_aux=True))(*arrays)
+    for a, e in zip(together, apart, strict=True):
+        np.testing.assert_array_equal(a, e)
+    assert_close(gradients, expected, 1e-12)
+
+
+def test_vmap_equals_a_loop():
+    arrays = stacked(range(2))
+    together = jax.jit(jax.vmap(fast))(*arrays)
+    apart = [fast(*(x[v] for x in arrays)) for v in range(2)]
+    expected = jax.tree.map(lambda *x: jnp.stack(x), *apart)
+    assert_close(jax.tree.leaves(together), jax.tree.leaves(expected), 1e-12)
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_extremes_are_finite(dtype):
+    means, quats, scales, opacities, features, viewmat, K = (x.astype(dtype) for x in scene(5))
+    opacities = opacities.at[:10].set(0).at[10:30].set(1)
+    quats = quats.at[::4].set(0)
+    scales = scales.at[1].set(0).at[2].set(100)
+    means = means.at[3].set(-viewmat[:3, 3]).at[4].multiply(-1)
+    values, gradients = fast(means, quats, scales, opacities, features, viewmat, K)
+    for x in (*values, *gradients):
+        assert x.dtype == dtype
+        assert np.all(np.isfinite(x))
+    assert np.all(gradients[3][:10] == 0)  # opacity 0 is inert: that is how dead rows are hidden
+    assert np.linalg.norm(gradients[3][10:30]) > 0
+
+
+def test_nothing_is_drawn_behind_the_camera():
+    means, *rest = scene(6)
+    values, gradients = fast(-means, *rest)
+    output = rasterize(-means, *rest, WIDTH, HEIGHT)
+    for x in (*values, *gradients, output.radii, output.pairs):
+        assert np.all(x == 0)
+
+
+def test_nan_is_not_hidden():
+    arrays = list(scene(8))
+    for position in range(5):
+        broken = list(arrays)
+        broken[position] = broken[position].at[7].set(jnp.nan)
+        assert np.isnan(fast(*broken)[0][0]).any(), NAMES[position]
+
+
+def test_radii_bound_what_is_drawn():
+    count = 60
+    means, quats, scales, opacities, _, viewmat, K = scene(11, count)
+    alone = jnp.eye(count)  # a channel per Gaussian shows where it contributes
+    scales, opacities = 0.2 * scales, opacities.at[::5].set(0.003)
+    output = rasterize(means, quats, scales, opacities, alone, viewmat, K, WIDTH, HEIGHT)
+    rows, columns, which = np.nonzero(np.asarray(output.features))
+    centres, radii = np.asarray(output.means2d), np.asarray(output.radii)
+    reach = np.maximum(abs(columns + 0.5 - centres[which, 0]), abs(rows + 0.5 - centres[which, 1]))
+    assert np.all(reach <= radii[which])
+    assert np.all(radii[::5] == 0)
+    assert np.max(reach / radii[which]) > 0.9  # and tightly
+
+
+def test_probe_moves_the_centres():
+    arrays = scene(2)
+    probe = jnp.full((40, 2), 0.25)
+    shifted = images(*arrays[:6], arrays[6].at[:2, 2].add(0.25))
+    probed = rasterize(*arrays, WIDTH, HEIGHT, means2d_probe=probe, pair_capacity=CAPACITY)
+    # A moved principal point also moves the clamp of the Jacobian, which no Gaussian of this scene meets.
+    assert_close((probed.features, probed.alpha, probed.depth), shifted)
+
+
+def test_overflow_is_reported():
+    arrays = scene(3)
+    needed = int(rasterize(*arrays, WIDTH, HEIGHT).pairs)
+    assert needed > 40
+    enough = rasterize(*arrays, WIDTH, HEIGHT, pair_capacity=needed)
+    short = rasterize(*arrays, WIDTH, HEIGHT, pair_capacity=needed - 1)
+    assert not enough.overflow
+    assert short.overflow
+    assert int(short.pairs) == needed
+    views = stacked((3, 3))
+    assert int(rasterize(*views, WIDTH, HEIGHT, pair_capacity=needed).pairs) == 2 * needed
+    assert_close((enough.features, enough.alpha, enough.depth), images(*arrays), 1e-14)
+
+
+@pytest.mark.parametrize("transformed", [jax.jit, lambda draw: jax.vmap(draw, axis_size=2)])
+def test_hidden_values_need_a_capacity(transformed):
+    arrays = stacked((0, 1))
+    with pytest.raises(ValueError, match="pair_capacity under jit or vmap"):
+        transformed(lambda *a: rasterize(*a, WIDTH, HEIGHT))(*arrays)
+
+
+def test_two_keys_sort_like_one():
+    random = np.random.default_rng(0)
+    tiles, ranks = random.integers(0, 8, 200).astype(np.int32), random.permutation(200).astype(np.int32)
+    one = _sorted(jnp.asarray(tiles), jnp.asarray(ranks), 7, 200)
+    two = _sorted(jnp.asarray(tiles), jnp.asarray(ranks), 7, 2**31)
+    order = np.lexsort((ranks, tiles))
+    for result in (one, two):
+        for actual, expected in zip(
+            result, (tiles[order], ranks[order], np.searchsorted(tiles[order], range(8))), strict=True
+        ):
+            np.testing.assert_array_equal(actual, expected)
