@@ -25,7 +25,8 @@ class ModelConfig:
     hidden: int = 128  # width of g, of the heads and of OCD-Net
     identity_start: bool = False  # heads and OCD-Net start as "no motion, a_j = 1" instead of at random
     illumination_offset: float = 0.5  # l = max(offset + sum a_j b_j B_j, 0)
-    reflectance_init: Literal["normal", "uniform"] = "uniform"  # N(0, 1) or U(0, 1)
+    # N(0, 1), U(0, 1), or the frames' colours at the points, with the darkening of tone.py undone
+    reflectance_init: Literal["normal", "uniform", "observed"] = "uniform"
     attenuation_init: Literal["normal", "uniform"] = "uniform"
     # B1, B2 that BAFE-Net starts at; None: zero bias, 5.5. B1 "auto": what the frames' darkness implies (tone.py)
     initial_exponents: tuple[float | Literal["auto"], float] | None = None
@@ -163,7 +164,6 @@ def _presets() -> dict[str, Config]:
     default = Config(
         coarse_steps=600,
         fine_steps=2400,
-        sh_warmup=300,
         model=ModelConfig(
             identity_start=True,
             hidden=64,

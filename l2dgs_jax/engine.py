@@ -17,7 +17,7 @@ from l2dgs_jax.data.batching import view_indices
 from l2dgs_jax.data.dataset import Dataset, Split
 from l2dgs_jax.density import GrowthStats
 from l2dgs_jax.rendering import render
-from l2dgs_jax.scene import groups, initialise, pad_rows, rung
+from l2dgs_jax.scene import groups, initialise, observed_colors, pad_rows, rung
 from l2dgs_jax.tone import darkening
 from l2dgs_jax.types import Camera, Scene, SceneParams
 
@@ -159,10 +159,15 @@ def adam(params: SceneParams, rates: dict[str, optim.Schedule], config: Config) 
     return optim.adam(groups(params), rates, config.optim.beta1, config.optim.beta2, config.optim.eps)
 
 
+def dark_level(split: Split) -> float:
+    """Mean sRGB value of the frames."""
+    return float(split.images.mean(dtype=np.float64))
+
+
 def resolve(config: Config, split: Split) -> Config:
     """The settings with what they leave to the data filled in from the training frames."""
-    model, dark_level = config.model, float(split.images.mean(dtype=np.float64))
-    exponent, gain = darkening(dark_level, config.loss.exposure_level)
+    model = config.model
+    exponent, gain = darkening(dark_level(split), config.loss.exposure_level)
     b1, b2 = model.initial_exponents or (None, None)
     if b1 == "auto":
         model = dataclasses.replace(model, initial_exponents=(round(exponent, 3), b2))
@@ -173,9 +178,14 @@ def resolve(config: Config, split: Split) -> Config:
 
 def initial_state(dataset: Dataset, config: Config) -> TrainState:
     """The state before the first step of a `resolve`d config; the same seed and data give the same state."""
-    capacity = rung(min(1.5 * len(dataset.points), max(config.density.max_gaussians, len(dataset.points))))
+    points, train = dataset.points, dataset.train
+    capacity = rung(min(1.5 * len(points), max(config.density.max_gaussians, len(points))))
+    reflectance = None
+    if config.model.reflectance_init == "observed":
+        law = darkening(dark_level(train), config.loss.exposure_level)
+        reflectance = (observed_colors(points, train.cameras, train.images) / law.gain) ** (1 / law.exponent)
     scene = initialise(
-        jax.random.key(config.seed), dataset.points, dataset.colors, dataset.train.cameras, config.model, capacity
+        jax.random.key(config.seed), points, dataset.colors, train.cameras, config.model, capacity, reflectance
     )
     return begin_stage(scene, jnp.zeros((), jnp.int32), config, config.coarse_steps)
 

@@ -41,6 +41,7 @@ def initialise(
     cameras: Camera,
     cfg: ModelConfig,
     capacity: int,
+    reflectance: np.ndarray | None = None,
 ) -> Scene:
     """A scene with one Gaussian a point, ready for training.
 
@@ -55,6 +56,7 @@ def initialise(
         cameras: the training cameras, [F]; their number sets the time resolution, their spread the extent.
         cfg: shape and initial state.
         capacity: rows to allocate; those past P are dead.
+        reflectance: [P 3] initial reflectance, for `cfg.reflectance_init` "observed".
     """
     count = len(points)
     distances, _ = cKDTree(points).query(points, k=min(4, count))
@@ -68,6 +70,7 @@ def initialise(
         jnp.asarray(points, float),
         jnp.asarray(0.5 * np.log(np.maximum(mean_square, 1e-7)), float),
         jnp.asarray(illumination, float),
+        None if reflectance is None else jnp.asarray(reflectance, float),
         jnp.asarray(camera_extent(cameras), float),
         cfg,
         len(cameras.time),
@@ -81,6 +84,7 @@ def _initialise(
     points: Float[Array, "P 3"],
     log_scales: Float[Array, " P"],
     illumination: Float[Array, " P"],
+    reflectance: Float[Array, "P 3"] | None,
     extent: Float[Array, ""],
     cfg: ModelConfig,
     num_frames: int,
@@ -96,7 +100,7 @@ def _initialise(
         logit_opacities=jnp.full(count, jax.scipy.special.logit(cfg.initial_opacity), points.dtype),
         illumination_dc=(illumination - cfg.illumination_offset)[:, None] / SH_DC,
         illumination_rest=jnp.zeros((count, (cfg.sh_degree + 1) ** 2 - 1)),
-        reflectance=random[cfg.reflectance_init](keys[0], (count, 3)),
+        reflectance=random[cfg.reflectance_init](keys[0], (count, 3)) if reflectance is None else reflectance,
         attenuation=random[cfg.attenuation_init](keys[1], (count, 2)),
     )
     params = SceneParams(
@@ -112,6 +116,29 @@ def _initialise(
         bounds=jnp.stack([points.min(0), points.max(0)]),
         extent=extent,
     )
+
+
+def observed_colors(
+    points: Float[np.ndarray, "P 3"], cameras: Camera, images: Float[np.ndarray, "F H W 3"]
+) -> Float[np.ndarray, "P 3"]:
+    """Median colour of the pixels that each point projects to, occlusion ignored; the images' mean where there are none.
+
+    Args:
+        points: world units.
+        cameras: F cameras.
+        images: their images, sRGB in [0, 1].
+    """
+    height, width = images.shape[1:3]
+    seen = np.full((len(images), len(points), 3), np.nan, np.float32)
+    for frame, (viewmat, K, image) in enumerate(zip(cameras.viewmat, cameras.K, images, strict=True)):
+        x, y, z = K @ (np.asarray(viewmat)[:3, :3] @ points.T + np.asarray(viewmat)[:3, 3:])
+        depth = np.where(z > 0, z, np.inf)
+        column, row = np.floor(x / depth).astype(int), np.floor(y / depth).astype(int)
+        inside = (z > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        seen[frame, inside] = image[row[inside], column[inside]]
+    unseen = np.isnan(seen).all((0, 2))
+    seen[:, unseen] = images.mean((0, 1, 2), dtype=np.float64)
+    return np.nanmedian(seen, axis=0)
 
 
 def groups(params: SceneParams) -> SceneParams:

@@ -14,9 +14,6 @@ from l2dgs_jax.config import ModelConfig
 CFG = ModelConfig(hidden=6, sh_degree=1)
 IDENTITY = dataclasses.replace(CFG, identity_start=True)
 
-init_heads = jax.jit(networks.init_heads, static_argnums=(1, 2))
-init_ocd = jax.jit(networks.init_ocd, static_argnums=1)
-init_bafe = jax.jit(networks.init_bafe, static_argnums=1)
 apply_bafe = jax.jit(networks.apply_bafe)
 bafe_value_and_grad = jax.jit(jax.value_and_grad(lambda p, x: networks.apply_bafe(p, x).sum(), (0, 1)))
 
@@ -25,10 +22,11 @@ def size(parameters):
     return sum(leaf.size for leaf in jax.tree.leaves(parameters))
 
 
-def shaken(parameters, seed=0):
-    """Parameters with every bias, scale and zero moved off its start, so that each can matter."""
+def random(init, *settings, seed=0):
+    """Parameters of the shapes that `init` makes, every one of them drawn, biases and scales too."""
     rng = np.random.default_rng(seed)
-    return jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf) + rng.normal(0, 0.3, leaf.shape)), parameters)
+    shapes = jax.eval_shape(lambda: init(jax.random.key(0), *settings))
+    return jax.tree.map(lambda leaf: jnp.asarray(rng.normal(0.1, 0.4, leaf.shape)), shapes)
 
 
 def noise(*shape, seed=5):
@@ -43,12 +41,12 @@ def test_parameter_counts_of_the_release():
 
 
 def test_weights_are_xavier_uniform_and_biases_zero():
-    heads = init_heads(jax.random.key(0), 30, dataclasses.replace(CFG, hidden=60))
+    heads = networks.init_heads(jax.random.key(0), 30, dataclasses.replace(CFG, hidden=60))
     for layer in (heads.aggregate, *heads.mean, *heads.quat, *heads.scale):
         limit = np.sqrt(6 / sum(layer.weight.shape))
         assert 0.9 * limit < np.abs(layer.weight).max() <= limit
         np.testing.assert_array_equal(layer.bias, 0)
-    conv = init_bafe(jax.random.key(0), CFG).conv2
+    conv = networks.init_bafe(jax.random.key(0), CFG).conv2
     limit = np.sqrt(6 / (9 * 8 + 9 * 16))
     assert 0.9 * limit < np.abs(conv.weight).max() <= limit
     first_layers = [heads.mean[0].weight, heads.quat[0].weight, heads.scale[0].weight]
@@ -57,7 +55,7 @@ def test_weights_are_xavier_uniform_and_biases_zero():
 
 
 def test_heads_match_a_plain_transcription():
-    heads, features = shaken(init_heads(jax.random.key(0), 5, CFG)), noise(2, 3, 5)
+    heads, features = random(networks.init_heads, 5, CFG), noise(2, 3, 5)
     relu = lambda x: np.maximum(x, 0)
     plain, features = jax.tree.map(np.asarray, (heads, features))
     hidden = features @ plain.aggregate.weight + plain.aggregate.bias
@@ -71,7 +69,7 @@ def test_heads_match_a_plain_transcription():
 
 
 def test_ocd_matches_a_plain_transcription():
-    ocd, hidden = shaken(init_ocd(jax.random.key(0), CFG)), noise(7, 6)
+    ocd, hidden = random(networks.init_ocd, CFG), noise(7, 6)
     elu = lambda x: np.where(x > 0, x, np.expm1(np.minimum(x, 0)))
     plain = jax.tree.map(np.asarray, ocd)
     inner = elu(elu(np.asarray(hidden)) @ plain.hidden.weight + plain.hidden.bias)
@@ -82,15 +80,15 @@ def test_ocd_matches_a_plain_transcription():
 
 
 def test_gradients_of_heads_and_ocd():
-    heads = shaken(init_heads(jax.random.key(0), 5, CFG))
+    heads = random(networks.init_heads, 5, CFG)
     check_grads(jax.jit(networks.apply_heads), (heads, noise(2, 5)), 1, ["fwd", "rev"])
-    ocd = shaken(init_ocd(jax.random.key(0), CFG))
+    ocd = random(networks.init_ocd, CFG)
     check_grads(jax.jit(networks.apply_ocd), (ocd, noise(3, 6)), 1, ["fwd", "rev"])
 
 
 def test_identity_start_is_no_motion_and_factor_one_and_can_learn():
     features = noise(4, 5)
-    heads, ocd = init_heads(jax.random.key(0), 5, IDENTITY), init_ocd(jax.random.key(1), IDENTITY)
+    heads, ocd = networks.init_heads(jax.random.key(0), 5, IDENTITY), networks.init_ocd(jax.random.key(1), IDENTITY)
     hidden, *motion = networks.apply_heads(heads, features)
     assert np.abs(hidden).max() > 0
     for moved in motion:
@@ -130,7 +128,7 @@ def plain_bafe(bafe, attenuation):
 
 
 def test_bafe_matches_a_plain_transcription_image_by_image():
-    bafe, images = shaken(init_bafe(jax.random.key(0), CFG)), noise(2, 7, 9, 2)
+    bafe, images = random(networks.init_bafe, CFG), noise(2, 7, 9, 2)
     actual = apply_bafe(bafe, images)
     for image, exponents in zip(images, actual, strict=True):
         np.testing.assert_allclose(exponents, plain_bafe(bafe, np.asarray(image)), rtol=1e-9)
@@ -138,13 +136,13 @@ def test_bafe_matches_a_plain_transcription_image_by_image():
 
 
 def test_gradients_of_bafe():
-    bafe = shaken(init_bafe(jax.random.key(0), CFG))
+    bafe = random(networks.init_bafe, CFG)
     check_grads(apply_bafe, (bafe, noise(2, 4, 5, 2)), 1, ["fwd", "rev"], eps=1e-6)
 
 
 @pytest.mark.parametrize("exponents", [(1.05, 9.0), (5.5, 5.5), (9.999, 1.001)])
 def test_initial_exponents_are_where_training_starts(exponents):
-    bafe = init_bafe(jax.random.key(0), dataclasses.replace(CFG, initial_exponents=exponents))
+    bafe = networks.init_bafe(jax.random.key(0), dataclasses.replace(CFG, initial_exponents=exponents))
     np.testing.assert_allclose(apply_bafe(bafe, noise(2, 4, 5, 2)), np.tile(exponents, (2, 4, 5, 1)), rtol=1e-12)
     gradient = bafe_value_and_grad(bafe, noise(4, 5, 2))[1][0]
     assert np.all(gradient.out.weight != 0)
@@ -152,7 +150,7 @@ def test_initial_exponents_are_where_training_starts(exponents):
 
 
 def test_without_initial_exponents_the_bias_is_zero_and_the_kernel_random():
-    out = init_bafe(jax.random.key(0), CFG).out
+    out = networks.init_bafe(jax.random.key(0), CFG).out
     np.testing.assert_array_equal(out.bias, 0)
     assert np.all(out.weight != 0)
 
@@ -160,12 +158,12 @@ def test_without_initial_exponents_the_bias_is_zero_and_the_kernel_random():
 @pytest.mark.parametrize("exponents", [(1.0, 9.0), (2.0, 10.0), (0.0, 5.0), (float("nan"), 5.0), ("auto", 9.0)])
 def test_impossible_initial_exponents_are_refused(exponents):
     with pytest.raises(ValueError, match="strictly between 1 and 10"):
-        init_bafe(jax.random.key(0), dataclasses.replace(CFG, initial_exponents=exponents))
+        networks.init_bafe(jax.random.key(0), dataclasses.replace(CFG, initial_exponents=exponents))
 
 
 @pytest.mark.parametrize("image", [np.zeros((4, 5, 2)), np.full((4, 5, 2), 1e30), np.ones((1, 1, 2))])
 def test_bafe_is_finite_at_extremes(image):
-    bafe = shaken(init_bafe(jax.random.key(0), CFG))
+    bafe = random(networks.init_bafe, CFG)
     value, gradients = jax.value_and_grad(lambda p, x: networks.apply_bafe(p, x).sum(), (0, 1))(
         bafe, jnp.asarray(image)
     )

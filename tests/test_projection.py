@@ -35,7 +35,7 @@ def scene():
 
 
 view = partial(project, width=32, height=20)
-outputs = lambda *arrays: view(*arrays)[:4]
+outputs = jax.jit(lambda *arrays: view(*arrays)[:4])
 
 
 def test_matches_the_golden_scene():
@@ -79,22 +79,21 @@ def test_rotations_are_rotations_whatever_the_norm(scene):
 
 
 def test_gradients(scene):
-    check_grads(jax.jit(outputs), scene, order=1, modes=("fwd", "rev"))
+    check_grads(outputs, scene, order=1, modes=("fwd", "rev"))
 
 
-@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
-def test_extremes_are_finite(scene, dtype):
-    means, quats, scales, viewmat, K = (x.astype(dtype) for x in scene)
+def test_extremes_are_finite(scene):
+    means, quats, scales, viewmat, K = (x.astype(jnp.float32) for x in scene)
     centre = -viewmat[:3, :3].T @ viewmat[:3, 3]
     forward = viewmat[2, :3]
     means = means.at[0].set(centre).at[1].set(centre - 3 * forward).at[2].set(centre + 0.0101 * forward)
     quats = quats.at[3].set(0)
     scales = scales.at[4].set(0).at[5].set(1e3)
     arrays = (means, quats, scales, viewmat, K)
-    values, pullback = jax.vjp(outputs, *arrays)
-    gradients = pullback(jax.tree.map(jnp.ones_like, values))
+    values = outputs(*arrays)
+    gradients = jax.jit(jax.grad(lambda *a: sum(jnp.sum(x) for x in outputs(*a)), tuple(range(5))))(*arrays)
     for x in (*values, *gradients):
-        assert x.dtype == dtype
+        assert x.dtype == jnp.float32
         assert np.all(np.isfinite(x))
     assert view(*arrays).visible.tolist() == [False, False, True, True, True, True]
     assert np.all(gradients[0][:2] == 0)
