@@ -29,7 +29,7 @@ def save(path: Path, checkpoint: Checkpoint, config: Config) -> None:
     header = json.dumps({"config": to_dict(config), "pair_capacity": checkpoint.pair_capacity})
     temporary = path.with_name(path.name + ".tmp")
     with open(temporary, "wb") as file:
-        np.savez(file, header=np.array(header), **arrays)
+        np.savez(file, header=np.array(header), **arrays)  # type: ignore[arg-type]
         file.flush()
         os.fsync(file.fileno())
     os.replace(temporary, path)

@@ -26,8 +26,10 @@ def main(command: Callable[[Sequence[str]], None], arguments: Sequence[str] | No
 
 def parse(kind: type[T], arguments: Sequence[str], program: str, default: T | None = None) -> T:
     """Parse command-line arguments into the dataclass `kind`."""
-    extra = {} if default is None else {"default": default}
-    return tyro.cli(kind, args=arguments, prog=f"python -m l2dgs_jax.{program}", **extra)
+    program = f"python -m l2dgs_jax.{program}"
+    if default is None:
+        return tyro.cli(kind, args=arguments, prog=program)
+    return tyro.cli(kind, args=arguments, prog=program, default=default)
 
 
 def use_compilation_cache() -> None:

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from l2dgs_jax import density, hexplane, losses, optim
+from l2dgs_jax import density, hexplane, losses, networks, optim
 from l2dgs_jax.config import Config
 from l2dgs_jax.data.batching import view_indices
 from l2dgs_jax.data.dataset import Dataset, Split
@@ -80,6 +80,12 @@ def sh_degree(step: Int[Array, ""] | int, config: Config) -> Int[Array, ""] | in
     return jnp.minimum(step // max(config.sh_warmup, 1), config.model.sh_degree)
 
 
+def exponent_target(config: Config) -> float:
+    """Where the prior of `config.loss.exponent_prior` pulls B1: its start, or 1 if that is left to chance."""
+    start = config.model.initial_exponents
+    return float(start[0]) if start else 1.0
+
+
 def objective(
     params: SceneParams,
     probe: Float[Array, "V N 2"],
@@ -111,8 +117,7 @@ def objective(
     cfg = config.loss
     start, steps = (config.coarse_steps, config.fine_steps) if moving else (0, config.coarse_steps)
     eta = losses.eta(state.step - start, steps, cfg) if cfg.eta_restarts else losses.eta(state.step, config.steps, cfg)
-    exponents = config.model.initial_exponents
-    loss, terms = losses.total(output, batch.images, cfg, eta, exponents[0] if exponents else 1.0)
+    loss, terms = losses.total(output, batch.images, cfg, eta, exponent_target(config))
     if moving:
         smoothness, time_smoothness, time_l1 = hexplane.regularisers(params.hexplane)
         loss += cfg.plane_smoothness * smoothness + cfg.time_smoothness * time_smoothness + cfg.time_l1 * time_l1
@@ -168,11 +173,11 @@ def resolve(config: Config, split: Split) -> Config:
     """The settings with what they leave to the data filled in from the training frames."""
     model = config.model
     exponent, gain = darkening(dark_level(split), config.loss.exposure_level)
-    b1, b2 = model.initial_exponents or (None, None)
-    if b1 == "auto":
-        model = dataclasses.replace(model, initial_exponents=(round(exponent, 3), b2))
+    if model.initial_exponents and model.initial_exponents[0] == "auto":
+        model = dataclasses.replace(model, initial_exponents=(round(exponent, 3), model.initial_exponents[1]))
     if model.initial_illumination == "auto":
-        model = dataclasses.replace(model, initial_illumination=round(gain ** (1 / (b2 or 1)), 3))
+        b2 = model.initial_exponents[1] if model.initial_exponents else networks.EXPONENT_CENTRE
+        model = dataclasses.replace(model, initial_illumination=round(gain ** (1 / b2), 3))
     return dataclasses.replace(config, model=model)
 
 

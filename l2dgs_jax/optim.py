@@ -24,7 +24,7 @@ class AdamState(NamedTuple):
     Schedules are state and not settings, so that one vmapped update serves scenes with different learning rates.
     """
 
-    count: Int[Array, "*S"]
+    step: Int[Array, "*S"]
     mu: PyTree
     nu: PyTree
     schedules: dict[str, Schedule]
@@ -98,15 +98,15 @@ def adam(groups: PyTree, rates: dict[str, Schedule], beta1: float, beta2: float,
 
     def update(gradients: PyTree, state: AdamState, params: PyTree) -> tuple[PyTree, AdamState]:
         del params
-        count = state.count + 1
+        step = state.step + 1
         mu = jax.tree.map(lambda m, g: beta1 * m + (1 - beta1) * g, state.mu, gradients)
         nu = jax.tree.map(lambda v, g: beta2 * v + (1 - beta2) * jnp.square(g), state.nu, gradients)
-        lr = {name: learning_rate(schedule, state.count) for name, schedule in state.schedules.items()}
+        lr = {name: learning_rate(schedule, state.step) for name, schedule in state.schedules.items()}
 
-        def step(group: str, m: Float[Array, "..."], v: Float[Array, "..."]) -> Float[Array, "..."]:
-            t = count.astype(m.dtype)
+        def move(group: str, m: Float[Array, "..."], v: Float[Array, "..."]) -> Float[Array, "..."]:
+            t = step.astype(m.dtype)
             return -lr[group] * (m / (1 - beta1**t)) / (jnp.sqrt(v / (1 - beta2**t)) + eps)
 
-        return jax.tree.map(step, groups, mu, nu), AdamState(count, mu, nu, state.schedules)
+        return jax.tree.map(move, groups, mu, nu), AdamState(step, mu, nu, state.schedules)
 
     return Transformation(init, update)

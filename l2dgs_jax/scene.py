@@ -1,6 +1,7 @@
 """A scene's initial state, its capacity, and the names of its parameter groups."""
 
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -10,10 +11,21 @@ from scipy.spatial import cKDTree
 
 from l2dgs_jax import hexplane, networks
 from l2dgs_jax.config import ModelConfig
-from l2dgs_jax.types import BAFENet, Camera, Gaussians, HexPlane, MotionHeads, OCDNet, Scene, SceneParams
+from l2dgs_jax.types import Camera, Gaussians, Scene, SceneParams
 
 SH_DC = 0.28209479177387814  # value of the first SH basis function
 LUMINANCE = np.array([0.2989, 0.587, 0.114])
+
+GAUSSIAN_GROUPS: dict[str, Any] = {
+    "means": "means",
+    "quats": "quats",
+    "log_scales": "scales",
+    "logit_opacities": "opacities",
+    "illumination_dc": "illumination",
+    "illumination_rest": "illumination_rest",
+    "reflectance": "reflectance",
+    "attenuation": "attenuation",
+}
 
 
 def rung(count: float | int, *, base: int = 1024) -> int:
@@ -121,7 +133,7 @@ def _initialise(
 def observed_colors(
     points: Float[np.ndarray, "P 3"], cameras: Camera, images: Float[np.ndarray, "F H W 3"]
 ) -> Float[np.ndarray, "P 3"]:
-    """Median colour of the pixels that each point projects to, occlusion ignored; the images' mean where there are none.
+    """Median colour of the pixels that each point projects to, occlusion ignored; the mean where none are.
 
     Args:
         points: world units.
@@ -144,21 +156,12 @@ def observed_colors(
 def groups(params: SceneParams) -> SceneParams:
     """The learning-rate group of every leaf of `params`, by name (see `optim.schedules`)."""
     label = lambda name, tree: jax.tree.map(lambda _: name, tree)
-    return SceneParams(
-        gaussians=Gaussians(
-            means="means",
-            quats="quats",
-            log_scales="scales",
-            logit_opacities="opacities",
-            illumination_dc="illumination",
-            illumination_rest="illumination_rest",
-            reflectance="reflectance",
-            attenuation="attenuation",
-        ),  # type: ignore[arg-type]
-        hexplane=HexPlane(*label("planes", params.hexplane)),
-        heads=MotionHeads(*label("heads", params.heads)),
-        ocd=OCDNet(*label("ocd", params.ocd)),
-        bafe=BAFENet(*label("bafe", params.bafe)),
+    return params._replace(
+        gaussians=Gaussians(**GAUSSIAN_GROUPS),
+        hexplane=label("planes", params.hexplane),
+        heads=label("heads", params.heads),
+        ocd=label("ocd", params.ocd),
+        bafe=label("bafe", params.bafe),
     )
 
 

@@ -1,5 +1,6 @@
 """The training step and loop on a tiny scene: gradients, resuming, growing, refusing."""
 
+import collections
 import dataclasses
 
 import jax
@@ -55,10 +56,9 @@ def dataset():
 
 
 def finish(dataset, config, state=None, pair_capacity=None):
-    last = None
-    for last in engine.run(dataset.train, config, state or engine.initial_state(dataset, config), pair_capacity):
-        pass
-    return last
+    """The last step of a run."""
+    steps = engine.run(dataset.train, config, state or engine.initial_state(dataset, config), pair_capacity)
+    return collections.deque(steps, maxlen=1).pop()
 
 
 @pytest.fixture(scope="module")
@@ -88,6 +88,17 @@ def objective_of(dataset, config, moving):
     return value, params, probe
 
 
+def random_like(tree, mask, key):
+    """Normal noise where `mask` is True, zeros elsewhere."""
+    leaves, treedef = jax.tree.flatten(tree)
+    keys = jax.random.split(key, len(leaves))
+    drawn = [
+        jax.random.normal(k, x.shape) if use else jnp.zeros_like(x)
+        for k, x, use in zip(keys, leaves, jax.tree.leaves(mask), strict=True)
+    ]
+    return treedef.unflatten(drawn)
+
+
 @pytest.mark.parametrize("preset", ["paper", "authors", "default"])
 @pytest.mark.parametrize("moving", [False, True])
 def test_gradient_of_the_whole_objective_by_directional_differences(dataset, preset, moving):
@@ -102,10 +113,7 @@ def test_gradient_of_the_whole_objective_by_directional_differences(dataset, pre
     }
     for index, (name, part) in enumerate(parts.items()):
         mask = jax.tree.map(lambda _: False, params)._replace(**{name: jax.tree.map(lambda _: True, part(params))})
-        keys = iter(jax.random.split(jax.random.key(index), 100))
-        direction = jax.tree.map(
-            lambda x, use: jax.random.normal(next(keys), x.shape) if use else jnp.zeros_like(x), params, mask
-        )
+        direction = random_like(params, mask, jax.random.key(index))
         slope = sum(jnp.vdot(g, d) for g, d in zip(*map(jax.tree.leaves, (gradient[0], direction)), strict=True))
         differences = []
         for step in (1e-6, 5e-7):
@@ -227,7 +235,7 @@ def test_a_bad_checkpoint_is_one_clear_sentence(dataset, tmp_path, damage):
         path.unlink()
     else:
         config = dataclasses.replace(config, batch_size=1)
-    with pytest.raises(UserError, match="checkpoint.npz: .*expected") as caught:
+    with pytest.raises(UserError, match=r"checkpoint\.npz: .*expected") as caught:
         checkpoint.load(path, config, engine.initial_state(dataset, config))
     assert "\n" not in str(caught.value)
     if damage == "settings":

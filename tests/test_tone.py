@@ -1,5 +1,7 @@
 """The darkening law against the images that it describes."""
 
+import itertools
+
 import numpy as np
 import pytest
 from skimage.color import rgb2xyz, xyz2rgb
@@ -30,7 +32,7 @@ def test_it_describes_an_underexposed_image(exposure):
 
 def test_darker_means_a_larger_exponent_and_a_smaller_gain():
     laws = [darkening(level, 0.46) for level in (0.06, 0.1, 0.2, 0.3)]
-    assert all(a.exponent > b.exponent and a.gain < b.gain for a, b in zip(laws, laws[1:], strict=False))
+    assert all(a.exponent > b.exponent and a.gain < b.gain for a, b in itertools.pairwise(laws))
 
 
 def test_a_bright_image_is_left_almost_as_it_is():
