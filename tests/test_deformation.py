@@ -71,6 +71,15 @@ ALIVE = jnp.ones(N, bool)
 moved_at = partial(run, alive=ALIVE, bounds=BOUNDS, cfg=CFG, sh_degree_active=2)
 
 
+@partial(jax.jit, static_argnames="moving")
+@partial(jax.grad, has_aux=True)
+def gradient_of_visible(params, alive, moving):
+    """As a rasterizer does: nothing of an invisible Gaussian counts."""
+    moved = moved_at(params, alive=alive, cameras=look(), moving=moving)
+    seen = jax.tree.map(lambda x: jnp.where(alive.reshape(1, -1, *[1] * (x.ndim - 2)), x, 0).sum(), moved)
+    return sum(seen), moved
+
+
 def plain_basis(v):
     """The first nine real spherical harmonics, from a table."""
     x, y, z = v
@@ -157,16 +166,8 @@ def test_dead_rows_are_invisible_and_get_no_gradient_even_when_they_hold_garbage
     dead = ~alive
     garbage = jax.tree.map(lambda rows: rows.at[jnp.flatnonzero(dead)].set(jnp.inf), params.gaussians)
 
-    @jax.jit
-    @partial(jax.grad, has_aux=True)
-    def gradient_of_sum(params):
-        moved = moved_at(params, alive=alive, cameras=look(), moving=True)
-        # What a rasterizer does: nothing of an invisible Gaussian counts.
-        seen = jax.tree.map(lambda x: jnp.where(alive.reshape(1, -1, *[1] * (x.ndim - 2)), x, 0).sum(), moved)
-        return sum(seen), moved
-
-    gradient, moved = gradient_of_sum(params._replace(gaussians=garbage))
-    expected, _ = gradient_of_sum(params)
+    gradient, moved = gradient_of_visible(params._replace(gaussians=garbage), alive, True)
+    expected, _ = gradient_of_visible(params, alive, True)
     np.testing.assert_array_equal(moved.opacities[:, dead], 0)
     assert np.all(moved.opacities[:, alive] > 0)
     for leaf in gradient.gaussians:
@@ -196,10 +197,8 @@ def test_finite_at_extremes(moving):
         log_scales=jnp.full((N, 3), -200.0),
         logit_opacities=jnp.array([1e3, -1e3, 0.0, 0.0, 0.0, 0.0]),
     )
-    f = lambda p: moved_at(p, cameras=cameras, moving=moving)
-    params = params._replace(gaussians=gaussians)
-    assert all(np.isfinite(x).all() for x in f(params))
-    gradient = jax.jit(jax.grad(lambda p: sum(x.sum() for x in f(p))))(params)
+    gradient, moved = gradient_of_visible(params._replace(gaussians=gaussians), ALIVE, moving)
+    assert all(np.isfinite(x).all() for x in moved)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
 
 

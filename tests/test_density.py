@@ -69,7 +69,9 @@ def test_samples_of_splits_follow_the_gaussian():
     rows = jax.tree.map(lambda x: jnp.tile(x[:1], (2 * count, *[1] * (x.ndim - 1))), gaussians(1))
     rows = rows._replace(means=jnp.zeros((2 * count, 3)), log_scales=jnp.tile(jnp.log(scales), (2 * count, 1)))
     alive = jnp.arange(2 * count) < count
-    result = run(rows, alive, stats(2.0 * alive.astype(float)), DensityConfig(grad_threshold=1.0, max_gaussians=2 * count))
+    result = run(
+        rows, alive, stats(2.0 * alive.astype(float)), DensityConfig(grad_threshold=1.0, max_gaussians=2 * count)
+    )
     assert result.alive.all()
     w, x, y, z = rows.quats[0] / jnp.linalg.norm(rows.quats[0])
     rotation = jnp.array(

@@ -16,7 +16,7 @@ from l2dgs_jax.rasterizer.intersect import MIN_ALPHA, TILE, TileLists, grid
 MAX_ALPHA = 0.999
 MIN_TRANSMITTANCE = 1e-4  # a Gaussian that would leave this little light ends its pixel and is left out
 BLOCK = 64  # tiles that walk their lists together
-CHUNK = 16  # Gaussians of a list that are blended at a time
+CHUNK = 8  # Gaussians of a list that are blended at a time
 PIXELS = TILE * TILE
 GEOMETRY = 6  # columns of a packed Gaussian before its features: mean (2), conic (3), opacity
 
