@@ -72,12 +72,12 @@ def features(
     times = jnp.clip(times if cfg.time_range == "full" else 0.5 + 0.5 * times, 0, 1)
     scales = []
     for space, time in zip(planes.space, planes.time, strict=True):
-        xy, yz, zx = _space_lookup(space, unit)
-        zt, xt, yt = _time_lookup(time, unit, times)
-        if cfg.aggregation == "paired_sum":
-            scales.append(xy[None] * zt + yz[None] * xt + zx[None] * yt)
-        else:
-            scales.append((xy * yz * zx)[None] * (zt * xt * yt))
+        low, weight = _cell(unit, space.shape[2])
+        weights = [_widen(weight[:, axis], space.shape[3]) for axis in range(3)]
+        in_space = _space_lookup(space, low, weights)
+        # Views in a Python loop: broadcasting one over the other transposes to a sum over views, which is slow.
+        at_times = [_aggregate(in_space, lines, cfg) for lines in _time_lookup(time, low, weights, times)]
+        scales.append(jnp.stack(at_times))
     return jnp.concatenate(scales, axis=-1)
 
 
@@ -109,40 +109,75 @@ def _cell(unit: Float[Array, "*S"], size: int) -> tuple[Int[Array, "*S"], Float[
     return low, position - low.astype(position.dtype)
 
 
-def _rows(table: Float[Array, "R C"], index: Int[Array, "*S"]) -> Float[Array, "*S C"]:
-    """Rows of a table; `_cell` keeps every index inside it, so neither bounds nor signs need checking."""
-    return table.at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)
+def _widen(weight: Float[Array, " N"], channels: int) -> Float[Array, "N C"]:
+    """A weight repeated for each channel.
+
+    A matrix product, not a broadcast, because of its transpose: XLA's CPU reduction over a few channels costs more than
+    everything else in the lookup. "highest" keeps the weights exact where products round their factors.
+    """
+    return jnp.matmul(weight[:, None], jnp.ones((1, channels), weight.dtype), precision="highest")
 
 
-def _space_lookup(planes: Float[Array, "3 S S C"], unit: Float[Array, "N 3"]) -> list[Float[Array, "N C"]]:
+def _lerp(start: Float[Array, "*S"], end: Float[Array, "*S"], weight: Float[Array, "*S"]) -> Float[Array, "*S"]:
+    return start + weight * (end - start)
+
+
+def _rows(table: Float[Array, "R C"], indices: list[Int[Array, " N"]]) -> list[Float[Array, "N C"]]:
+    """For each index vector, those rows of the table: one gather in all, hence one scatter backward.
+
+    `_cell` keeps every index inside the table, so neither bounds nor signs need checking.
+    """
+    rows = table.at[jnp.concatenate(indices)].get(mode="promise_in_bounds", wrap_negative_indices=False)
+    return jnp.split(rows, len(indices))
+
+
+def _space_lookup(
+    planes: Float[Array, "3 S S C"], low: Int[Array, "N 3"], weights: list[Float[Array, "N C"]]
+) -> list[Float[Array, "N C"]]:
     """Bilinear values of the planes XY, YZ, ZX."""
-    size, channels = planes.shape[-2:]
+    size, channels = planes.shape[2:]
     table = planes.reshape(-1, channels)
-    low, weight = _cell(unit, size)
-    values = []
-    for plane, (a, b) in enumerate(SPACE_AXES):
-        corner = (plane * size + low[:, a]) * size + low[:, b]
-        u, v = weight[:, a, None], weight[:, b, None]
-        before = (1 - v) * _rows(table, corner) + v * _rows(table, corner + 1)
-        after = (1 - v) * _rows(table, corner + size) + v * _rows(table, corner + size + 1)
-        values.append((1 - u) * before + u * after)
-    return values
+    corner = lambda offset: _rows(
+        table, [(plane * size + low[:, a]) * size + low[:, b] + offset for plane, (a, b) in enumerate(SPACE_AXES)]
+    )
+    corners = zip(SPACE_AXES, corner(0), corner(1), corner(size), corner(size + 1), strict=True)
+    return [
+        _lerp(_lerp(c00, c01, weights[b]), _lerp(c10, c11, weights[b]), weights[a])
+        for (a, b), c00, c01, c10, c11 in corners
+    ]
 
 
 def _time_lookup(
-    planes: Float[Array, "3 T S C"], unit: Float[Array, "N 3"], times: Float[Array, " V"]
-) -> list[Float[Array, "V N C"]]:
-    """Values of the planes Zt, Xt, Yt: mixed in time first, then read along the line that remains."""
-    time_size, size, channels = planes.shape[1:]
-    row, mix = _cell(times, time_size)
-    mix = mix[None, :, None, None]
-    lines = (1 - mix) * planes[:, row] + mix * planes[:, row + 1]
+    planes: Float[Array, "3 T S C"],
+    low: Int[Array, "N 3"],
+    weights: list[Float[Array, "N C"]],
+    times: Float[Array, " V"],
+) -> list[list[Float[Array, "N C"]]]:
+    """For each time, the values of the planes Zt, Xt, Yt: mixed in time, then read along the line that remains."""
+    row, mix = _cell(times, planes.shape[1])
+    views, (size, channels) = range(len(times)), planes.shape[2:]
+    lines = _lerp(
+        planes[:, row], planes[:, row + 1], jnp.broadcast_to(mix[None, :, None, None], (3, len(times), size, channels))
+    )
     table = lines.reshape(-1, channels)
-    low, weight = _cell(unit, size)
-    views = jnp.arange(times.shape[0], dtype=low.dtype)[:, None]
-    values = []
-    for plane, axis in enumerate(TIME_AXES):
-        start = (plane * times.shape[0] + views) * size + low[None, :, axis]
-        along = weight[None, :, axis, None]
-        values.append((1 - along) * _rows(table, start) + along * _rows(table, start + 1))
-    return values
+    end = lambda offset: _rows(
+        table,
+        [
+            (line * len(times) + view) * size + low[:, axis] + offset
+            for view in views
+            for line, axis in enumerate(TIME_AXES)
+        ],
+    )
+    values = [
+        _lerp(before, after, weights[TIME_AXES[k % 3]])
+        for k, (before, after) in enumerate(zip(end(0), end(1), strict=True))
+    ]
+    return [values[3 * view : 3 * view + 3] for view in views]
+
+
+def _aggregate(
+    space: list[Float[Array, "N C"]], time: list[Float[Array, "N C"]], cfg: ModelConfig
+) -> Float[Array, "N C"]:
+    """The argument of g in Eq. 1, or the product of all six features."""
+    xy, yz, zx = (plane * line for plane, line in zip(space, time, strict=True))
+    return xy + yz + zx if cfg.aggregation == "paired_sum" else xy * yz * zx
