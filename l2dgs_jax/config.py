@@ -102,6 +102,7 @@ class DensityConfig:
     interval: int = 100
     grad_threshold: float = 2e-4  # mean norm of dL/d(mean2d), normalised device coordinates
     clone_below: float = 0.01  # of the extent; larger Gaussians split
+    conserve_opacity: bool = False  # a new pair covers as much as its source did (arXiv 2404.06109)
     prune_opacity: float = 0.005
     prune_above: int = 0  # prune only when more Gaussians than this exist
     max_gaussians: int = 360_000
@@ -165,9 +166,10 @@ def _presets() -> dict[str, Config]:
         coarse_steps=600,
         fine_steps=2400,
         model=ModelConfig(
-            identity_start=True,
             hidden=64,
             plane_scales=(1, 2),
+            identity_start=True,
+            reflectance_init="observed",
             initial_exponents=("auto", 9.0),
             initial_illumination="auto",
         ),
@@ -182,9 +184,16 @@ def _presets() -> dict[str, Config]:
             illumination_tv=1.0,
             exponent_prior=0.2,
         ),
-        optim=OptimConfig(reflectance_lr=5e-3, attenuation_lr=5e-3, extent_scales=("means",), decay_steps=None),
+        optim=OptimConfig(reflectance_lr=5e-3, attenuation_lr=5e-3, decay_steps=None),
+        density=DensityConfig(start=600, stop=1500, interval=200, grad_threshold=5e-4, conserve_opacity=True),
     )
-    demo = dataclasses.replace(default, coarse_steps=300, fine_steps=700)
+    demo = dataclasses.replace(
+        default,
+        coarse_steps=200,
+        fine_steps=300,
+        sh_warmup=200,
+        model=dataclasses.replace(default.model, plane_size=32, hidden=32),
+    )
     return {"paper": paper, "authors": authors, "default": default, "demo": demo}
 
 

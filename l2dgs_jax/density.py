@@ -88,6 +88,11 @@ def densify(
     target = jnp.where(chosen, free_rows[rank], capacity)  # row `capacity` does not exist: the write is dropped
 
     split = chosen & (jnp.exp(gaussians.log_scales).max(-1) > cfg.clone_below * extent)
+    if cfg.conserve_opacity:
+        # Two Gaussians of opacity 1 - sqrt(1 - o), one behind the other, cover what one of opacity o did.
+        let_through = jnp.sqrt(jax.nn.sigmoid(-gaussians.logit_opacities))
+        shared = jnp.log1p(-let_through) - jnp.log(let_through)
+        gaussians = gaussians._replace(logit_opacities=jnp.where(chosen, shared, gaussians.logit_opacities))
     first, second = (_sample(gaussians, split, k) for k in jax.random.split(key))
     written = jax.tree.map(lambda old, new: old.at[target].set(new, mode="drop"), first, second)
     born = jnp.zeros(capacity, bool).at[target].set(True, mode="drop")

@@ -164,11 +164,12 @@ def _conv(layer: Conv, x: Float[Array, "B H W I"]) -> Float[Array, "B H W O"]:
 
 def _group_norm(layer: GroupNorm, x: Float[Array, "B H W C"], groups: int) -> Float[Array, "B H W C"]:
     """Zero mean and unit variance over each image and group of channels, then an affine map a channel."""
-    grouped = x.reshape(*x.shape[:3], groups, -1)
-    centred = grouped - grouped.mean((1, 2, 4), keepdims=True)
-    variance = jnp.square(centred).mean((1, 2, 4), keepdims=True)
-    normal = (centred * jax.lax.rsqrt(variance + GROUP_NORM_EPS)).reshape(x.shape)
-    return normal * layer.scale[None, None, None] + layer.bias[None, None, None]
+    # Pooling the pixels first keeps the channel axis whole; statistics over a split axis are much slower on CPU.
+    group_mean = lambda y: y.mean((1, 2)).reshape(len(y), groups, -1).mean(-1)
+    pool = lambda y: jnp.repeat(group_mean(y), y.shape[-1] // groups, axis=-1)[:, None, None]
+    centred = x - pool(x)
+    gain = layer.scale[None, None, None] * jax.lax.rsqrt(pool(jnp.square(centred)) + GROUP_NORM_EPS)
+    return centred * gain + layer.bias[None, None, None]
 
 
 def _exponent_inverse(exponent: float | str) -> float:

@@ -129,3 +129,15 @@ def test_accumulate_sums_views_before_the_norm_and_counts_sightings_once():
     result = accumulate(stats([1.0, 1.0], [5.0, 5.0]), gradient, radii, 2, 4)
     np.testing.assert_allclose(result.gradient, [1 + 5.0, 1 + 0.0])
     np.testing.assert_allclose(result.seen, [6.0, 5.0])
+
+
+def test_a_conserving_pair_covers_what_its_source_did():
+    cfg = DensityConfig(grad_threshold=1.0, clone_below=0.1, conserve_opacity=True)
+    rows = gaussians(4)._replace(logit_opacities=jnp.array([-3.0, 0.0, 8.0, 0.0]))
+    alive = [True, True, True, False]
+    for chosen in range(3):
+        result = run(rows, alive, stats(jnp.eye(4)[chosen] * 2), cfg)
+        before = jax.nn.sigmoid(rows.logit_opacities)
+        after = jax.nn.sigmoid(result.gaussians.logit_opacities)
+        np.testing.assert_allclose(1 - (1 - after[chosen]) * (1 - after[3]), before[chosen], rtol=1e-9)
+        np.testing.assert_array_equal(np.delete(after, [chosen, 3]), np.delete(before, [chosen, 3]))
