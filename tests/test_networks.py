@@ -41,7 +41,7 @@ def test_parameter_counts_of_the_release():
 
 
 def test_weights_are_xavier_uniform_and_biases_zero():
-    heads = networks.init_heads(jax.random.key(0), 30, dataclasses.replace(CFG, hidden=60))
+    heads = networks.init_heads(jax.random.key(0), 60, dataclasses.replace(CFG, hidden=60))
     for layer in (heads.aggregate, *heads.mean, *heads.quat, *heads.scale):
         limit = np.sqrt(6 / sum(layer.weight.shape))
         assert 0.9 * limit < np.abs(layer.weight).max() <= limit
