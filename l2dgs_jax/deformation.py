@@ -63,8 +63,8 @@ def deform(
 def _active_coefficients(gaussians: Gaussians, degree: int, active: Int[Array, ""] | int) -> Float[Array, "1 N J"]:
     """The b_j of Eq. 2, those of bands above `active` set to zero."""
     coefficients = jnp.concatenate([gaussians.illumination_dc, gaussians.illumination_rest], axis=-1)
-    bands = np.repeat(np.arange(degree + 1), 2 * np.arange(degree + 1) + 1)
-    return jnp.where((bands <= active)[None], coefficients, 0)[None]
+    bands = np.repeat(np.arange(degree + 1, dtype=np.int32), 2 * np.arange(degree + 1) + 1)
+    return jnp.where((bands <= jnp.asarray(active, jnp.int32))[None], coefficients, 0)[None]
 
 
 def _illumination(

@@ -4,6 +4,7 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from l2dgs_jax.config import ModelConfig
@@ -58,9 +59,8 @@ def render(
     )
     features = drawn.features
     if cfg.background:
-        lit = jnp.arange(features.shape[-1]) < 4
-        uncovered = (1 - drawn.alpha)[..., None] * lit.astype(features.dtype)
-        features = features + cfg.background * uncovered
+        lit = np.arange(features.shape[-1]) < 4
+        features = features + cfg.background * jnp.where(lit[None, None, None], 1 - drawn.alpha[..., None], 0)
     return RenderOutput(
         images=decompose(features, scene.params.bafe),
         alpha=drawn.alpha,

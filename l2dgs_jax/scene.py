@@ -6,7 +6,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray, Shaped
 from scipy.spatial import cKDTree
 
 from l2dgs_jax import hexplane, networks
@@ -165,6 +165,6 @@ def groups(params: SceneParams) -> SceneParams:
     )
 
 
-def pad_rows(rows: Float[Array, "N ..."], capacity: int) -> Float[Array, "M ..."]:
+def pad_rows(rows: Shaped[Array, "N ..."], capacity: int) -> Shaped[Array, "M ..."]:
     """Append zero rows up to `capacity`."""
     return jnp.pad(rows, [(0, capacity - rows.shape[0])] + [(0, 0)] * (rows.ndim - 1))
