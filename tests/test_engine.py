@@ -77,6 +77,8 @@ def objective_of(dataset, config, moving):
     jitter = lambda x, key: x + 0.03 * jax.random.normal(jax.random.key(key), x.shape, x.dtype)
     leaves, treedef = jax.tree.flatten(state.scene.params)
     params = treedef.unflatten([jitter(x, key) for key, x in enumerate(leaves)])
+    # With random weights, OCD-Net's last ReLU may start dead, and the objective would not depend on it.
+    params = params._replace(ocd=params.ocd._replace(out=params.ocd.out._replace(bias=params.ocd.out.bias + 1)))
     batch = engine.load_batch(dataset.train, np.array([1, 4]))
     batch = jax.tree.map(lambda x: jnp.asarray(x, float), batch)
     probe = jnp.zeros((2, state.scene.alive.shape[0], 2))
