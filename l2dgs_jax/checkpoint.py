@@ -48,7 +48,7 @@ def load(path: Path, config: Config, like: TrainState) -> Checkpoint:
     """
     leaves, treedef = jax.tree_util.tree_flatten_with_path(like)
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as file:
             header = json.loads(str(file["header"]))
             saved = header["config"]
             arrays = {name: file[name] for name in file.files if name != "header"}
