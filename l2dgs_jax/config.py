@@ -202,9 +202,9 @@ def _presets() -> dict[str, Config]:
     # A smaller motion field, for a few minutes on two cores.
     demo = dataclasses.replace(
         default,
-        coarse_steps=200,
-        fine_steps=300,
-        sh_warmup=200,
+        coarse_steps=150,
+        fine_steps=250,
+        sh_warmup=150,
         model=dataclasses.replace(default.model, plane_size=32, hidden=32),
     )
     return {"paper": paper, "authors": authors, "default": default, "demo": demo}
