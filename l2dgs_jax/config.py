@@ -173,7 +173,8 @@ def _presets() -> dict[str, Config]:
             plane_scales=(1, 2),
             # The fine stage then starts from the coarse stage's result instead of from a jump.
             identity_start=True,
-            # Random: 29.0 / 18.5 / .49 after 600 coarse steps; observed: 32.9 / 20.7 / .73 after 400.
+            # Random: 29.0 / 18.5 / .49 after 600 coarse steps; observed: 32.9 / 20.7 / .73 after 400. Not a clean
+            # comparison: the first run's SH warm-up was shorter and it grew just before it was scored.
             reflectance_init="observed",
             # The dark frame raised to 1 / B1 times its best gain scores 29.7 dB, the best gain alone 22.4 dB.
             initial_exponents=("auto", 9.0),

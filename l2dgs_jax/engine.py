@@ -18,7 +18,7 @@ from l2dgs_jax.data.dataset import Dataset, Split
 from l2dgs_jax.density import GrowthStats
 from l2dgs_jax.rendering import render
 from l2dgs_jax.scene import groups, initialise, observed_colors, pad_rows, rung
-from l2dgs_jax.tone import darkening
+from l2dgs_jax.tone import Darkening, darkening
 from l2dgs_jax.types import Camera, Scene, SceneParams
 
 with warnings.catch_warnings():
@@ -164,15 +164,15 @@ def adam(params: SceneParams, rates: dict[str, optim.Schedule], config: Config) 
     return optim.adam(groups(params), rates, config.optim.beta1, config.optim.beta2, config.optim.eps)
 
 
-def dark_level(split: Split) -> float:
-    """Mean sRGB value of the frames."""
-    return float(split.images.mean(dtype=np.float64))
+def split_darkening(split: Split, config: Config) -> Darkening:
+    """How the frames are darker than `config.loss.exposure_level`."""
+    return darkening(float(split.images.mean(dtype=np.float64)), config.loss.exposure_level)
 
 
 def resolve(config: Config, split: Split) -> Config:
     """The settings with what they leave to the data filled in from the training frames."""
     model = config.model
-    exponent, gain = darkening(dark_level(split), config.loss.exposure_level)
+    exponent, gain = split_darkening(split, config)
     if model.initial_exponents and model.initial_exponents[0] == "auto":
         model = dataclasses.replace(model, initial_exponents=(round(exponent, 3), model.initial_exponents[1]))
     if model.initial_illumination == "auto":
@@ -187,7 +187,7 @@ def initial_state(dataset: Dataset, config: Config) -> TrainState:
     capacity = rung(min(1.5 * len(points), max(config.density.max_gaussians, len(points))))
     reflectance = None
     if config.model.reflectance_init == "observed":
-        law = darkening(dark_level(train), config.loss.exposure_level)
+        law = split_darkening(train, config)
         reflectance = (observed_colors(points, train.cameras, train.images) / law.gain) ** (1 / law.exponent)
     scene = initialise(
         jax.random.key(config.seed), points, dataset.colors, train.cameras, config.model, capacity, reflectance
