@@ -23,6 +23,7 @@ class ModelConfig:
     time_range: Literal["full", "upper"] = "full"  # "upper": t in [0, 1] read as [-1, 1], half of each time plane
     aggregation: Literal["paired_sum", "product"] = "paired_sum"  # Eq. 1, or the product of all six planes
     hidden: int = 128  # width of g, of the heads and of OCD-Net
+    opacity_head: bool = False  # a fourth head moves the opacity's logit, as 4DGS can (arXiv 2310.08528)
     identity_start: bool = False  # heads and OCD-Net start as "no motion, a_j = 1" instead of at random
     illumination_offset: float = 0.5  # l = max(offset + sum a_j b_j B_j, 0)
     # N(0, 1), U(0, 1), or the frames' colours at the points, with the darkening of tone.py undone

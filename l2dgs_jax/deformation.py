@@ -41,19 +41,22 @@ def deform(
         lambda rows: jnp.where(alive.reshape(-1, *[1] * (rows.ndim - 1)), rows, 0), params.gaussians
     )
     per_view = lambda rows: jnp.broadcast_to(rows[None], (*cameras.time.shape, *rows.shape))
-    means, quats, log_scales = map(per_view, (gaussians.means, gaussians.quats, gaussians.log_scales))
+    raw = (gaussians.means, gaussians.quats, gaussians.log_scales, gaussians.logit_opacities)
+    means, quats, log_scales, logit_opacities = map(per_view, raw)
     coefficients = _active_coefficients(gaussians, cfg.sh_degree, sh_degree_active)
     if moving:
         # The same features feed the heads and OCD-Net: Eqs. 1 and 4 name them both f.
         field = hexplane.features(params.hexplane, gaussians.means, bounds, cameras.time, cfg)
-        hidden, *motion = networks.apply_heads(params.heads, field)
-        means, quats, log_scales = means + motion[0], quats + motion[1], log_scales + motion[2]
+        hidden, motion = networks.apply_heads(params.heads, field)
+        means, quats, log_scales = means + motion.means, quats + motion.quats, log_scales + motion.log_scales
+        if motion.logit_opacities is not None:
+            logit_opacities += motion.logit_opacities
         coefficients = networks.apply_ocd(params.ocd, hidden) * coefficients
     return MovedGaussians(
         means=means,
         quats=quats,
         scales=jnp.exp(log_scales),
-        opacities=per_view(jnp.where(alive, jax.nn.sigmoid(gaussians.logit_opacities), 0)),
+        opacities=jnp.where(alive[None], jax.nn.sigmoid(logit_opacities), 0),
         illumination=_illumination(coefficients, gaussians.means, cameras.viewmat, cfg),
         reflectance=per_view(gaussians.reflectance),
         attenuation=per_view(gaussians.attenuation),

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from l2dgs_jax.config import ModelConfig
-from l2dgs_jax.types import BAFENet, Conv, GroupNorm, Linear, MotionHeads, OCDNet
+from l2dgs_jax.types import BAFENet, Conv, GroupNorm, Linear, Motion, MotionHeads, OCDNet
 
 # B1 and B2 lie in the open interval CENTRE - REACH ... CENTRE + REACH.
 EXPONENT_CENTRE = 5.5
@@ -26,9 +26,9 @@ def init_heads(key: PRNGKeyArray, feature_size: int, cfg: ModelConfig) -> Motion
     Args:
         key: randomness of the weights.
         feature_size: channels of a HexPlane feature.
-        cfg: `hidden` and `identity_start`.
+        cfg: `hidden`, `identity_start` and `opacity_head`.
     """
-    keys = jax.random.split(key, 7)
+    keys = jax.random.split(key, 9)
 
     def head(first: PRNGKeyArray, last: PRNGKeyArray, size: int) -> tuple[Linear, Linear]:
         out = _linear(last, cfg.hidden, size)
@@ -39,12 +39,11 @@ def init_heads(key: PRNGKeyArray, feature_size: int, cfg: ModelConfig) -> Motion
         mean=head(keys[1], keys[2], 3),
         quat=head(keys[3], keys[4], 4),
         scale=head(keys[5], keys[6], 3),
+        opacity=head(keys[7], keys[8], 1) if cfg.opacity_head else None,
     )
 
 
-def apply_heads(
-    heads: MotionHeads, features: Float[Array, "*B F"]
-) -> tuple[Float[Array, "*B H"], Float[Array, "*B 3"], Float[Array, "*B 4"], Float[Array, "*B 3"]]:
+def apply_heads(heads: MotionHeads, features: Float[Array, "*B F"]) -> tuple[Float[Array, "*B H"], Motion]:
     """Displacements at an instant, to be added to raw parameters. Gradients flow to both arguments.
 
     Args:
@@ -52,12 +51,17 @@ def apply_heads(
         features: HexPlane features.
 
     Returns:
-        f of Eq. 1, and the additions to means, quaternions and logarithmic scales.
+        f of Eq. 1, and the displacements.
     """
     hidden = _affine(heads.aggregate, features)
     active = jax.nn.relu(hidden)
     move = lambda head: _affine(head[1], jax.nn.relu(_affine(head[0], active)))
-    return hidden, move(heads.mean), move(heads.quat), move(heads.scale)
+    return hidden, Motion(
+        means=move(heads.mean),
+        quats=move(heads.quat),
+        log_scales=move(heads.scale),
+        logit_opacities=None if heads.opacity is None else move(heads.opacity)[..., 0],
+    )
 
 
 def init_ocd(key: PRNGKeyArray, cfg: ModelConfig) -> OCDNet:

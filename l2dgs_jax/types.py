@@ -101,12 +101,22 @@ class HexPlane(NamedTuple):
 
 
 class MotionHeads(NamedTuple):
-    """The aggregation g of Eq. 1 and the mu, Q and S heads: two affine layers each, the first shared width."""
+    """The aggregation g of Eq. 1 and the mu, Q and S heads, two affine layers each; optionally one for the opacity."""
 
     aggregate: Linear
     mean: tuple[Linear, Linear]
     quat: tuple[Linear, Linear]
     scale: tuple[Linear, Linear]
+    opacity: tuple[Linear, Linear] | None
+
+
+class Motion(NamedTuple):
+    """What the heads add to raw parameters at an instant; `logit_opacities` is None without that head."""
+
+    means: Float[Array, "*B 3"]
+    quats: Float[Array, "*B 4"]
+    log_scales: Float[Array, "*B 3"]
+    logit_opacities: Float[Array, "*B"] | None
 
 
 class OCDNet(NamedTuple):

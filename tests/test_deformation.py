@@ -14,7 +14,9 @@ from l2dgs_jax.config import ModelConfig
 from l2dgs_jax.deformation import deform
 from l2dgs_jax.types import Camera, Gaussians, SceneParams
 
-CFG = ModelConfig(plane_size=3, plane_scales=(1, 2), plane_channels=2, time_size=3, hidden=5, sh_degree=2)
+CFG = ModelConfig(
+    plane_size=3, plane_scales=(1, 2), plane_channels=2, time_size=3, hidden=5, sh_degree=2, opacity_head=True
+)
 BOUNDS = jnp.asarray(np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))
 N = 6
 
@@ -24,7 +26,7 @@ run = jax.jit(deform, static_argnames=("cfg", "moving"))
 @partial(jax.jit, static_argnums=2)
 def field_and_motion(params, times, cfg):
     field = hexplane.features(params.hexplane, params.gaussians.means, BOUNDS, times, cfg)
-    hidden, *motion = networks.apply_heads(params.heads, field)
+    hidden, motion = networks.apply_heads(params.heads, field)
     return motion, networks.apply_ocd(params.ocd, hidden)
 
 
@@ -142,15 +144,25 @@ def test_coarse_stage_is_the_canonical_scene_in_every_view():
 def test_fine_stage_adds_the_heads_to_the_raw_parameters():
     params, cameras = scene(), look()
     g, moved = params.gaussians, moved_at(params, cameras=cameras, moving=True)
-    (mean, quat, log_scale), _ = field_and_motion(params, cameras.time, CFG)
-    g, mean, quat, log_scale = jax.tree.map(np.asarray, (g, mean, quat, log_scale))
-    np.testing.assert_allclose(moved.means, g.means[None] + mean, rtol=1e-12)
-    np.testing.assert_allclose(moved.quats, g.quats[None] + quat, rtol=1e-12)
-    np.testing.assert_allclose(moved.scales, np.exp(g.log_scales[None] + log_scale), rtol=1e-12)
+    motion, _ = field_and_motion(params, cameras.time, CFG)
+    g, motion = jax.tree.map(np.asarray, (g, motion))
+    np.testing.assert_allclose(moved.means, g.means[None] + motion.means, rtol=1e-12)
+    np.testing.assert_allclose(moved.quats, g.quats[None] + motion.quats, rtol=1e-12)
+    np.testing.assert_allclose(moved.scales, np.exp(g.log_scales[None] + motion.log_scales), rtol=1e-12)
+    logits = g.logit_opacities[None] + motion.logit_opacities
+    np.testing.assert_allclose(moved.opacities, 1 / (1 + np.exp(-logits)), rtol=1e-12)
     assert np.abs(moved.means[0] - moved.means[1]).max() > 1e-3
     still = moved_at(params, cameras=cameras, moving=False)
-    for name in ("opacities", "reflectance", "attenuation"):
+    for name in ("reflectance", "attenuation"):
         np.testing.assert_array_equal(getattr(moved, name), getattr(still, name))
+
+
+def test_without_its_head_the_opacity_does_not_depend_on_time():
+    params = scene()
+    params = params._replace(heads=params.heads._replace(opacity=None))
+    moving, still = (moved_at(params, cameras=look(), moving=moving) for moving in (True, False))
+    np.testing.assert_array_equal(moving.opacities, still.opacities)
+    assert np.any(moving.means != still.means)
 
 
 def test_identity_start_makes_the_first_fine_step_equal_to_the_last_coarse_one():

@@ -11,7 +11,7 @@ from jax.test_util import check_grads
 from l2dgs_jax import networks
 from l2dgs_jax.config import ModelConfig
 
-CFG = ModelConfig(hidden=6, sh_degree=1)
+CFG = ModelConfig(hidden=6, sh_degree=1, opacity_head=True)
 IDENTITY = dataclasses.replace(CFG, identity_start=True)
 
 apply_bafe = jax.jit(networks.apply_bafe)
@@ -42,7 +42,7 @@ def test_parameter_counts_of_the_release():
 
 def test_weights_are_xavier_uniform_and_biases_zero():
     heads = networks.init_heads(jax.random.key(0), 60, dataclasses.replace(CFG, hidden=60))
-    for layer in (heads.aggregate, *heads.mean, *heads.quat, *heads.scale):
+    for layer in (heads.aggregate, *heads.mean, *heads.quat, *heads.scale, *heads.opacity):
         limit = np.sqrt(6 / sum(layer.weight.shape))
         assert 0.9 * limit < np.abs(layer.weight).max() <= limit
         np.testing.assert_array_equal(layer.bias, 0)
@@ -62,9 +62,10 @@ def test_heads_match_a_plain_transcription():
     expected = [hidden]
     for first, last in plain[1:]:
         expected.append(relu(relu(hidden) @ first.weight + first.bias) @ last.weight + last.bias)
-    actual = networks.apply_heads(heads, jnp.asarray(features))
-    assert [x.shape for x in actual] == [(2, 3, 6), (2, 3, 3), (2, 3, 4), (2, 3, 3)]
-    for a, e in zip(actual, expected, strict=True):
+    expected[-1] = expected[-1][..., 0]
+    hidden, motion = networks.apply_heads(heads, jnp.asarray(features))
+    assert [x.shape for x in (hidden, *motion)] == [(2, 3, 6), (2, 3, 3), (2, 3, 4), (2, 3, 3), (2, 3)]
+    for a, e in zip((hidden, *motion), expected, strict=True):
         np.testing.assert_allclose(a, e, rtol=1e-12)
 
 
@@ -89,12 +90,14 @@ def test_gradients_of_heads_and_ocd():
 def test_identity_start_is_no_motion_and_factor_one_and_can_learn():
     features = noise(4, 5)
     heads, ocd = networks.init_heads(jax.random.key(0), 5, IDENTITY), networks.init_ocd(jax.random.key(1), IDENTITY)
-    hidden, *motion = networks.apply_heads(heads, features)
+    hidden, motion = networks.apply_heads(heads, features)
     assert np.abs(hidden).max() > 0
     for moved in motion:
         np.testing.assert_array_equal(moved, 0)
     np.testing.assert_array_equal(networks.apply_ocd(ocd, hidden), 1)
-    gradients = jax.jit(jax.grad(lambda h: sum(x.sum() for x in networks.apply_heads(h, features))))(heads)
+    gradients = jax.jit(jax.grad(lambda h: sum(x.sum() for x in jax.tree.leaves(networks.apply_heads(h, features)))))(
+        heads
+    )
     for _, last in gradients[1:]:
         assert np.all(last.bias != 0)
         assert np.any(last.weight != 0)
