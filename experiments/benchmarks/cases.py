@@ -1,0 +1,217 @@
+"""What is measured. A case is a function that returns its figures by name; names end in their unit."""
+
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from experiments.benchmarks.native import NativeBlend
+from experiments.benchmarks.scenes import cloud, training
+from experiments.benchmarks.stopwatch import best_of, peak_memory, resident_memory
+from l2dgs_jax import engine, hexplane, losses, networks
+from l2dgs_jax.config import PRESETS
+from l2dgs_jax.decomposition import decompose
+from l2dgs_jax.deformation import deform
+from l2dgs_jax.rasterizer import rasterize
+from l2dgs_jax.rendering import Renderer
+from l2dgs_jax.types import Camera, MovedGaussians, RenderOutput, Scene
+
+Figures = dict[str, float]
+
+CONFIG = PRESETS["default"]
+SIZES = {"10k_160x96": (10_000, 160, 96), "50k_480x270": (50_000, 480, 270), "50k_800x450": (50_000, 800, 450)}
+STEPS = {"10k_200x112": (10_000, 200, 112), "40k_400x225": (40_000, 400, 225), "50k_800x450": (50_000, 800, 450)}
+
+
+def rasterizer() -> Figures:
+    """Forward, and forward plus backward in every input, next to a C blend of the same lists."""
+    figures = {}
+    for name, size in SIZES.items():
+        forward, both, pairs = _rasterizer(*size)
+        native = NativeBlend(cloud(*size), *size[1:])
+        limit = best_of(native.forward), best_of(native.backward)
+        figures |= {
+            f"{name}_forward_ms": best_of(forward),
+            f"{name}_forward_backward_ms": best_of(both),
+            f"{name}_pairs": pairs,
+            f"{name}_native_forward_ms": limit[0],
+            f"{name}_native_forward_backward_ms": sum(limit),
+        }
+        figures[f"{name}_over_native"] = figures[f"{name}_forward_backward_ms"] / sum(limit)
+    return figures
+
+
+def growth() -> Figures:
+    """Rasterizer, forward plus backward, per million pairs as the work grows."""
+    figures = {}
+    for count in (5_000, 20_000, 50_000, 200_000):
+        for width, height in ((200, 112), (400, 225), (800, 450)):
+            _, both, pairs = _rasterizer(count, width, height)
+            milliseconds, name = best_of(both, 5), f"{count // 1000}k_{width}x{height}"
+            figures |= {f"{name}_ms": milliseconds, f"{name}_pairs": pairs}
+            figures[f"{name}_ms_per_million_pairs"] = 1e6 * milliseconds / pairs
+    return figures
+
+
+def parts() -> Figures:
+    """The parts of a fine step, each with its gradient: 40 k Gaussians, two views of 400x225."""
+    width, height = 400, 225
+    state, batch = training(40_000, width, height, CONFIG)
+    scene, params, cfg = state.scene, state.scene.params, CONFIG.model
+    images = jnp.asarray(batch.images)
+    move = lambda p: _move(scene._replace(params=p), batch.cameras)
+    look = lambda p: hexplane.features(p.hexplane, p.gaussians.means, scene.bounds, batch.cameras.time, cfg)
+    moved, field = move(params), jax.jit(look)(params)
+    channels = jnp.concatenate([moved.illumination[..., None], moved.reflectance, moved.attenuation], axis=-1)
+    capacity = engine.rung(_pairs(moved, channels, batch.cameras, width, height))
+
+    def draw(moved, channels):
+        geometry = (moved.means, moved.quats, moved.scales, moved.opacities)
+        camera = (batch.cameras.viewmat, batch.cameras.K)
+        return rasterize(*geometry, channels, *camera, width, height, pair_capacity=capacity)
+
+    drawn = jax.jit(draw)(moved, channels)
+
+    def judge(features, bafe):
+        output = RenderOutput(decompose(features, bafe), *drawn[1:3], drawn.radii, drawn.pairs, drawn.overflow)
+        return losses.total(output, images, CONFIG.loss, 0.9, 1.5)[0]
+
+    def mlps(heads, ocd, field):
+        hidden, motion = networks.apply_heads(heads, field)
+        return motion, networks.apply_ocd(ocd, hidden)
+
+    optimizer = engine.adam(params, state.adam.schedules, CONFIG)
+    adam = jax.jit(lambda params, adam: optimizer.update(params, adam, params))
+    return {
+        "hexplane_ms": _with_gradient(look, params),
+        "heads_and_ocd_ms": _with_gradient(mlps, params.heads, params.ocd, field),
+        "deform_ms": _with_gradient(move, params),
+        "rasterizer_ms": _with_gradient(lambda m, c: draw(m, c)[:3], moved, channels),
+        "bafe_ms": _with_gradient(networks.apply_bafe, params.bafe, drawn.features[..., 4:]),
+        "decompose_and_losses_ms": _with_gradient(judge, drawn.features, params.bafe),
+        "plane_regularisers_ms": _with_gradient(hexplane.regularisers, params.hexplane),
+        "adam_ms": best_of(lambda: adam(params, state.adam)),
+    }
+
+
+def step() -> Figures:
+    """The whole fine step: loss, gradient and Adam, two views."""
+    figures = {}
+    for name, size in STEPS.items():
+        take = _stepper(*size)
+        figures[f"{name}_ms"] = best_of(take, 5)
+    return figures
+
+
+def rendering() -> Figures:
+    """Well-lit frames of a moving scene, 40 k Gaussians at 400x225, the camera and the instant new in each."""
+    state, batch = training(40_000, 400, 225, CONFIG)
+    renderer = Renderer(state.scene, CONFIG.model, 400, 225, moving=True, sh_degree=3)
+    camera = Camera(*(np.asarray(x[0]) for x in batch.cameras))
+    times = iter(np.linspace(0, 1, 1000, dtype=np.float32))
+    frame = lambda: np.asarray(renderer(camera._replace(time=next(times))).images.welllit)
+    return {"frames_per_s": 1e3 / best_of(frame, 30)}
+
+
+def compiling() -> Figures:
+    """Time to the end of the first fine step in a new process, cache empty and then filled."""
+    with tempfile.TemporaryDirectory() as folder:
+        cold, cached = (float(_child("first_step", folder)) for _ in range(2))
+    return {"cold_s": cold, "cached_s": cached}
+
+
+def memory() -> Figures:
+    """Peak of a process that takes steps of 50 k Gaussians at 800x450, and what 1,000 small steps add."""
+    peak, growth = (float(_child(name)) for name in ("large_steps", "thousand_steps"))
+    return {"50k_800x450_peak_gib": peak, "thousand_steps_growth_gib": growth}
+
+
+CASES: dict[str, Callable[[], Figures]] = {
+    case.__name__: case for case in (rasterizer, growth, parts, step, rendering, compiling, memory)
+}
+
+
+@jax.jit
+def _move(scene: Scene, cameras: Camera) -> MovedGaussians:
+    return deform(scene.params, scene.alive, scene.bounds, cameras, CONFIG.model, moving=True, sh_degree_active=3)
+
+
+def _rasterizer(count: int, width: int, height: int) -> tuple[Callable, Callable, int]:
+    arrays = {name: jnp.asarray(array) for name, array in cloud(count, width, height).items()}
+    learned = tuple(arrays[name] for name in ("means", "quats", "scales", "opacities", "features"))
+    camera = (arrays["viewmat"], arrays["K"])
+    pairs = int(rasterize(*learned, *camera, width, height).pairs)
+    draw = lambda *x: rasterize(*x, *camera, width, height, pair_capacity=engine.rung(pairs))[:3]
+    weights = jax.tree.map(lambda x: jax.random.normal(jax.random.key(0), x.shape), jax.eval_shape(draw, *learned))
+
+    def loss(*x):
+        return sum(jnp.vdot(w, image) for w, image in zip(weights, draw(*x), strict=True))
+
+    forward, both = jax.jit(draw), jax.jit(jax.value_and_grad(loss, range(5)))
+    return lambda: forward(*learned), lambda: both(*learned), pairs
+
+
+def _with_gradient(function: Callable, *arguments: Any) -> float:
+    square = lambda tree: sum(jnp.vdot(x, x) for x in jax.tree.leaves(tree))
+    gradient = jax.jit(jax.grad(lambda *x: square(function(*x)), range(len(arguments))))
+    return best_of(lambda: gradient(*arguments), 7)
+
+
+def _pairs(moved: MovedGaussians, channels: jax.Array, cameras: Camera, width: int, height: int) -> int:
+    geometry = (moved.means, moved.quats, moved.scales, moved.opacities)
+    return int(rasterize(*geometry, channels, cameras.viewmat, cameras.K, width, height).pairs)
+
+
+def _stepper(count: int, width: int, height: int) -> Callable[[], Any]:
+    """Takes the next training step at every call; the pair buffer fits from the first on."""
+    state, batch = training(count, width, height, CONFIG)
+    moved = _move(state.scene, batch.cameras)
+    capacity = engine.rung(1.1 * _pairs(moved, moved.reflectance, batch.cameras, width, height))
+
+    def take():
+        nonlocal state
+        state, report = engine.train_step(state, batch, CONFIG, moving=True, pair_capacity=capacity)
+        if report.overflow or not report.finite:
+            raise RuntimeError("the measured step was refused")
+        return report
+
+    return take
+
+
+def _child(name: str, *arguments: str) -> str:
+    """What a function of this module prints in a process of its own."""
+    program = f"import sys; from experiments.benchmarks import cases; cases._{name}(*sys.argv[1:])"
+    done = subprocess.run([sys.executable, "-c", program, *arguments], check=True, capture_output=True, text=True)
+    return done.stdout.split()[-1]
+
+
+def _first_step(folder: str) -> None:
+    jax.config.update("jax_compilation_cache_dir", folder)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+    state, batch = training(7_000, 200, 112, CONFIG)
+    start = time.perf_counter()
+    jax.block_until_ready(engine.train_step(state, batch, CONFIG, moving=True, pair_capacity=engine.rung(200_000)))
+    print(time.perf_counter() - start)
+
+
+def _large_steps() -> None:
+    take = _stepper(50_000, 800, 450)
+    for _ in range(5):
+        take()
+    print(peak_memory())
+
+
+def _thousand_steps() -> None:
+    take = _stepper(1_000, 96, 64)
+    for _ in range(100):
+        take()
+    before = resident_memory()
+    for _ in range(1000):
+        take()
+    print(resident_memory() - before)

@@ -1,0 +1,64 @@
+"""Scenes of any size to measure on: random clouds that fill the view, as the golden tests use, and whole models."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.special import logit
+
+from l2dgs_jax.config import Config
+from l2dgs_jax.engine import Batch, TrainState, begin_stage
+from l2dgs_jax.scene import initialise
+from l2dgs_jax.types import Camera
+
+
+def cloud(count: int, width: int, height: int, *, channels: int = 6, seed: int = 0) -> dict[str, np.ndarray]:
+    """Gaussians at depths 2 to 6 in a 60 degree view, a little wider than it.
+
+    World sizes depend on `count` only, so footprints in pixels grow with the resolution.
+    """
+    rng = np.random.default_rng(seed)
+    focal = width / (2 * np.tan(np.deg2rad(30)))
+    z = rng.uniform(2, 6, count)
+    x = rng.uniform(-1.1, 1.1, count) * (width / 2 / focal) * z
+    y = rng.uniform(-1.1, 1.1, count) * (height / 2 / focal) * z
+    angle = np.deg2rad(20.0)
+    rotation = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+    translation = np.array([0.1, -0.2, 0.3])
+    viewmat = np.eye(4)
+    viewmat[:3, :3], viewmat[:3, 3] = rotation, translation
+    scales = np.exp(rng.normal(np.log(3 / np.sqrt(count)), 0.5, (count, 3)))
+    quats = rng.normal(size=(count, 4))
+    arrays = {
+        "means": (np.stack([x, y, z], 1) - translation) @ rotation,
+        "quats": quats / np.linalg.norm(quats, axis=1, keepdims=True),
+        "scales": scales,
+        "opacities": 1 / (1 + np.exp(-rng.normal(0, 1.5, count))),
+        "features": rng.uniform(0, 1, (count, channels)),
+        "viewmat": viewmat,
+        "K": np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]]),
+    }
+    return {name: np.asarray(array, np.float32) for name, array in arrays.items()}
+
+
+def training(count: int, width: int, height: int, config: Config, *, frames: int = 60) -> tuple[TrainState, Batch]:
+    """A fine-stage state whose Gaussians are a `cloud`, and a batch of noise to fit it to."""
+    arrays = cloud(count, width, height)
+    rng = np.random.default_rng(1)
+    viewmats = np.tile(arrays["viewmat"], (frames, 1, 1))
+    viewmats[:, :3, 3] += rng.normal(0, 0.1, (frames, 3))
+    cameras = Camera(
+        viewmats.astype(np.float32),
+        np.tile(arrays["K"], (frames, 1, 1)),
+        np.linspace(0, 1, frames, dtype=np.float32),
+    )
+    scene = initialise(jax.random.key(0), arrays["means"], None, cameras, config.model, count)
+    gaussians = scene.params.gaussians._replace(
+        quats=jnp.asarray(arrays["quats"]),
+        log_scales=jnp.log(arrays["scales"]),
+        logit_opacities=logit(arrays["opacities"]),
+    )
+    scene = scene._replace(params=scene.params._replace(gaussians=gaussians))
+    state = begin_stage(scene, jnp.asarray(config.coarse_steps, jnp.int32), config, config.fine_steps)
+    views = np.linspace(0, frames - 1, config.batch_size).astype(int)
+    images = rng.uniform(0, 0.2, (config.batch_size, height, width, 3)).astype(np.float32)
+    return state, Batch(Camera(*(x[views] for x in cameras)), images)
