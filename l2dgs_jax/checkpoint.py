@@ -13,6 +13,7 @@ import numpy as np
 from l2dgs_jax.config import Config, to_dict
 from l2dgs_jax.engine import TrainState
 from l2dgs_jax.errors import UserError
+from l2dgs_jax.files import replacing
 
 
 class Checkpoint(NamedTuple):
@@ -23,16 +24,18 @@ class Checkpoint(NamedTuple):
 
 
 def save(path: Path, checkpoint: Checkpoint, config: Config) -> None:
-    """Write to a temporary file beside `path`, then rename: a reader sees the old file or the new one."""
+    """Write a state; a reader sees the old file or the new one.
+
+    Raises:
+        UserError: the file cannot be written.
+    """
     leaves, _ = jax.tree_util.tree_flatten_with_path(checkpoint.state)
     arrays = {jax.tree_util.keystr(key): np.asarray(leaf) for key, leaf in leaves}
     header = json.dumps({"config": to_dict(config), "pair_capacity": checkpoint.pair_capacity})
-    temporary = path.with_name(path.name + ".tmp")
-    with open(temporary, "wb") as file:
+    with replacing(path) as temporary, open(temporary, "wb") as file:
         np.savez(file, header=np.array(header), **arrays)  # type: ignore[arg-type]
         file.flush()
         os.fsync(file.fileno())
-    os.replace(temporary, path)
 
 
 def load(path: Path, config: Config, like: TrainState) -> Checkpoint:

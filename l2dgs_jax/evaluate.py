@@ -12,10 +12,10 @@ from jaxtyping import Bool, Float, Shaped
 
 from l2dgs_jax import cli, metrics, runs
 from l2dgs_jax.errors import UserError
+from l2dgs_jax.files import replacing
 from l2dgs_jax.metrics import RegionScore
 from l2dgs_jax.render import choose_split, views
 from l2dgs_jax.runs import Run
-from l2dgs_jax.visualize import replacing
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from l2dgs_jax.config import Config, from_dict, to_dict
 from l2dgs_jax.data import load
 from l2dgs_jax.data.dataset import Dataset
 from l2dgs_jax.errors import UserError
+from l2dgs_jax.files import replacing
 from l2dgs_jax.rendering import Renderer
 
 SETTINGS = "config.json"
@@ -53,9 +54,17 @@ class Run:
 
 
 def write_settings(folder: Path, scene: str, config: Config) -> None:
-    """Create the run folder and its `config.json`."""
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / SETTINGS).write_text(json.dumps({"scene": scene, "settings": to_dict(config)}, indent=2) + "\n")
+    """Create the run folder and its `config.json`.
+
+    Raises:
+        UserError: the folder cannot be made or written to.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"{folder}: cannot be made ({error.strerror}); expected a writable place") from None
+    with replacing(folder / SETTINGS) as temporary:
+        temporary.write_text(json.dumps({"scene": scene, "settings": to_dict(config)}, indent=2) + "\n")
 
 
 def read_settings(folder: Path) -> tuple[str, Config]:

@@ -1,8 +1,7 @@
 """Pictures and videos of a run: contact sheet, a path through space and time, and the files they go to."""
 
 import contextlib
-import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
 from l2dgs_jax.errors import UserError
+from l2dgs_jax.files import replacing
 from l2dgs_jax.runs import Run
 from l2dgs_jax.types import Camera, RenderOutput
 
@@ -184,27 +184,6 @@ def write_video(path: Path, frames: Iterable[UInt8[np.ndarray, "H W 3"]], fps: i
                     raise UserError(f"{path}: cannot be written; expected an OpenCV with the mp4v codec")
             even = np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), "edge")
             writer.write(cv2.cvtColor(even, cv2.COLOR_RGB2BGR))
-
-
-@contextlib.contextmanager
-def replacing(path: Path) -> Iterator[Path]:
-    """A temporary file beside `path` to write to; it takes the place of `path` if the block ends without an error.
-
-    Raises:
-        UserError: the folder is missing or not writable, or `path` is a folder.
-    """
-    if not path.parent.is_dir():
-        raise UserError(f"{path}: cannot be written; expected an existing folder {path.parent}")
-    if path.is_dir():
-        raise UserError(f"{path}: is a folder; expected a file to write")
-    temporary = path.with_name(f"{path.stem}.tmp{path.suffix}")
-    try:
-        yield temporary
-        os.replace(temporary, path)
-    except OSError as error:
-        raise UserError(f"{path}: cannot be written ({error.strerror}); expected a writable folder") from None
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def _nearby(at: Float[np.ndarray, " A"], times: Float[np.ndarray, " F"], bandwidth: float) -> Float[np.ndarray, "A F"]:

@@ -68,7 +68,7 @@ def test_a_run_leaves_what_it_promises(finished):
     assert cv2.imread(str(folder / runs.CONTACT_SHEET)).std() > 1
     assert cv2.VideoCapture(str(folder / runs.VIDEO)).get(cv2.CAP_PROP_FRAME_COUNT) > 24
     assert (folder / runs.COARSE).exists()
-    assert not list(folder.glob("*.tmp"))
+    assert not list(folder.glob("*.tmp*"))
     assert "12/12" in done.stderr
     assert "low-light" in done.stderr
     assert "Gaussians" in done.stderr
@@ -161,6 +161,11 @@ def test_output_that_holds_another_run(refuses, scene, finished):
 def test_output_that_is_a_file(refuses, scene, tmp_path):
     (tmp_path / "file").write_text("")
     refuses(scene, "--output", tmp_path / "file", naming=["file"])
+
+
+def test_output_that_cannot_be_made(refuses, scene, tmp_path):
+    (tmp_path / "file").write_text("")
+    refuses(scene, "--output", tmp_path / "file" / "run", naming=["file/run"])
 
 
 def test_resume_without_a_run(refuses, scene, tmp_path):

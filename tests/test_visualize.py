@@ -217,27 +217,6 @@ def test_written_images_read_back_exactly(tmp_path, shape, kind):
     assert [p.name for p in tmp_path.iterdir()] == ["image.png"]
 
 
-def test_a_file_is_replaced_whole_or_not_at_all(tmp_path):
-    path = tmp_path / "file.txt"
-    path.write_text("old")
-
-    class PowerCutError(Exception):
-        pass
-
-    def cut():
-        with visualize.replacing(path) as temporary:
-            temporary.write_text("half of the n")
-            raise PowerCutError
-
-    with pytest.raises(PowerCutError):
-        cut()
-    assert path.read_text() == "old"
-    assert [p.name for p in tmp_path.iterdir()] == ["file.txt"]
-    with visualize.replacing(path) as temporary:
-        temporary.write_text("new")
-    assert path.read_text() == "new"
-
-
 def test_files_that_cannot_be_written_are_clear_errors(tmp_path):
     image = np.zeros((4, 4, 3), np.uint8)
     with pytest.raises(UserError, match=r"missing/image\.png.*expected an existing folder .*missing"):
