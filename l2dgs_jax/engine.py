@@ -184,7 +184,9 @@ def resolve(config: Config, split: Split) -> Config:
 def initial_state(dataset: Dataset, config: Config) -> TrainState:
     """The state before the first step of a `resolve`d config; the same seed and data give the same state."""
     points, train = dataset.points, dataset.train
-    capacity = rung(min(1.5 * len(points), max(config.density.max_gaussians, len(points))))
+    capacity = len(points)
+    if config.density.start < config.density.stop:
+        capacity = rung(min(1.5 * capacity, max(config.density.max_gaussians, capacity)))
     reflectance = None
     if config.model.reflectance_init == "observed":
         law = split_darkening(train, config)

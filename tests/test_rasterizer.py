@@ -129,6 +129,16 @@ def test_an_image_of_one_pixel():
     assert all(np.all(np.isfinite(x)) and np.any(x != 0) for x in gradients)
 
 
+# One tile, as many tiles as a block of either kind, one more than that, and a few blocks with a remainder.
+@pytest.mark.parametrize(("width", "height"), [(8, 8), (32, 16), (72, 8), (33, 39)])
+def test_tiles_that_fill_blocks_or_do_not(width, height):
+    arrays = scene(10, width=width, height=height)
+    values, gradients = fast(*arrays, width=width, height=height)
+    expected, expected_gradients = dense(*arrays, width=width, height=height)
+    assert_close(values, expected)
+    assert_close(gradients, expected_gradients)
+
+
 def test_numerical_gradients():
     # Wide, faint, few: no contribution is near a threshold, where the image jumps.
     means, quats, scales, _, features, viewmat, K = (x[:3] if i < 5 else x for i, x in enumerate(scene(7)))

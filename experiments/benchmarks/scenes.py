@@ -1,13 +1,16 @@
 """Scenes of any size to measure on: random clouds that fill the view, as the golden tests use, and whole models."""
 
-import jax
+from functools import partial
+
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import logit
 
+from l2dgs_jax import engine
 from l2dgs_jax.config import Config
-from l2dgs_jax.engine import Batch, TrainState, begin_stage
-from l2dgs_jax.scene import initialise
+from l2dgs_jax.data.dataset import Dataset, Split
+from l2dgs_jax.engine import Batch, TrainState
+from l2dgs_jax.scene import pad_rows
 from l2dgs_jax.types import Camera
 
 
@@ -51,14 +54,16 @@ def training(count: int, width: int, height: int, config: Config, *, frames: int
         np.tile(arrays["K"], (frames, 1, 1)),
         np.linspace(0, 1, frames, dtype=np.float32),
     )
-    scene = initialise(jax.random.key(0), arrays["means"], None, cameras, config.model, count)
+    noise = rng.uniform(0, 0.2, (height, width, 3)).astype(np.float16)
+    split = Split(tuple(map(str, range(frames))), cameras, np.broadcast_to(noise, (frames, *noise.shape)))
+    config = engine.resolve(config, split)
+    scene = engine.initial_state(Dataset("cloud", width, height, split, split, arrays["means"]), config).scene
+    rows = partial(pad_rows, capacity=len(scene.alive))
     gaussians = scene.params.gaussians._replace(
-        quats=jnp.asarray(arrays["quats"]),
-        log_scales=jnp.log(arrays["scales"]),
-        logit_opacities=logit(arrays["opacities"]),
+        quats=rows(jnp.asarray(arrays["quats"])),
+        log_scales=rows(jnp.log(arrays["scales"])),
+        logit_opacities=rows(logit(arrays["opacities"])),
     )
     scene = scene._replace(params=scene.params._replace(gaussians=gaussians))
-    state = begin_stage(scene, jnp.asarray(config.coarse_steps, jnp.int32), config, config.fine_steps)
-    views = np.linspace(0, frames - 1, config.batch_size).astype(int)
-    images = rng.uniform(0, 0.2, (config.batch_size, height, width, 3)).astype(np.float32)
-    return state, Batch(Camera(*(x[views] for x in cameras)), images)
+    state = engine.begin_stage(scene, jnp.asarray(config.coarse_steps, jnp.int32), config, config.fine_steps)
+    return state, engine.load_batch(split, np.linspace(0, frames - 1, config.batch_size).astype(int))

@@ -1,0 +1,48 @@
+"""Loops that XLA's CPU compiler turns into one native function."""
+
+from collections.abc import Callable
+from typing import TypeVar
+
+import jax
+import jax.numpy as jnp
+import jaxlib
+from jax.experimental.xla_metadata import set_xla_metadata
+from jaxtyping import Array, Float, Int
+
+T = TypeVar("T")
+
+# The attributes of `one_function` are XLA's own: only the compilers that were tried with them are given them.
+TRIED = jaxlib.__version__.startswith("0.10.")
+
+
+def one_function(function: Callable[..., T]) -> Callable[..., T]:
+    """The same function, compiled for CPU as a whole; it then runs on one thread.
+
+    Otherwise XLA's CPU runtime starts every operation of a loop's body anew and divides it among threads, which takes
+    longer than an operation on a few kilobytes itself. `function` may hold loops, gathers, slices and arithmetic, but
+    no sort, scatter, matrix product or reduction of a product, and must use every argument, in loops of two steps or
+    more: XLA aborts on an argument that its simplifications leave unused.
+    """
+    if not TRIED:
+        return function
+
+    def call(*arguments):
+        leaves, structure = jax.tree.flatten(jax.jit(function)(*arguments))
+        leaves = set_xla_metadata(leaves, xla_cpu_small_call="true", inlineable="false")
+        return jax.tree.unflatten(structure, leaves)
+
+    return call
+
+
+def add_rows_in_turn(
+    table: Float[Array, "N D"], ids: Int[Array, "*S"], rows: Float[Array, "*S D"]
+) -> Float[Array, "N D"]:
+    """`table.at[ids].add(rows)` as a loop, which `one_function` can hold."""
+    ids, rows = ids.reshape(-1), rows.reshape(-1, table.shape[1])
+
+    def add(i, table):
+        place, one = (ids[i], jnp.int32(0)), (1, table.shape[1])
+        row = jax.lax.dynamic_slice(table, place, one) + jax.lax.dynamic_slice(rows, (i, jnp.int32(0)), one)
+        return jax.lax.dynamic_update_slice(table, row, place)
+
+    return jax.lax.fori_loop(jnp.int32(0), jnp.int32(ids.shape[0]), add, table)
