@@ -1,12 +1,12 @@
 """Image quality: PSNR and SSIM, their masked forms, and the scores of a held-out split."""
 
 from collections.abc import Sequence
-from functools import partial
 from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.custom_derivatives import linear_call
 from jaxtyping import Array, Bool, Float
 
 RADIUS = 5  # of the 11x11 SSIM window
@@ -91,13 +91,17 @@ def ssim_map(
         border: what windows see beyond the image: "zero" (3D Gaussian Splatting's loss) or the image mirrored
             about its edge (scikit-image).
     """
-    # Only the sum of the two variances enters SSIM: four blurred images do instead of five. The mean of b stands apart
-    # so that a gradient in `a` alone sends only three of them back.
-    mean_a, square, product = _blur(jnp.stack([a, a * a + b * b, a * b]), border)
-    mean_b = _blur(b, border)
+    if border == "mirror":
+        edges = [(0, 0)] * (a.ndim - 3) + [(RADIUS, RADIUS)] * 2 + [(0, 0)]
+        a, b = (jnp.pad(image, edges, "symmetric") for image in (a, b))
+    # Only the sum of the two variances enters SSIM: four blurred images do instead of five.
+    mean_a, mean_b, square, product = map(_blur, (a, b, a * a + b * b, a * b))
     means = mean_a * mean_b
     mean_squares = mean_a * mean_a + mean_b * mean_b
-    return ((2 * means + C1) * (2 * (product - means) + C2)) / ((mean_squares + C1) * (square - mean_squares + C2))
+    similarity = ((2 * means + C1) * (2 * (product - means) + C2)) / (
+        (mean_squares + C1) * (square - mean_squares + C2)
+    )
+    return similarity if border == "zero" else similarity[..., RADIUS:-RADIUS, RADIUS:-RADIUS, :]
 
 
 def ssim(a: Float[Array, "*B H W C"], b: Float[Array, "*B H W C"]) -> Float[Array, "*B"]:
@@ -132,19 +136,26 @@ def _masked_mean(values: Float[Array, "*B H W C"], mask: Bool[Array, "*B H W"]) 
     return (values.mean(-1) * weights).sum((-2, -1)) / weights.sum((-2, -1))
 
 
-def _blur(images: Float[Array, "*B H W C"], border: Border) -> Float[Array, "*B H W C"]:
-    *_, height, width, _ = images.shape
-    rows, columns = (jnp.asarray(_blur_matrix(n, border), images.dtype) for n in (height, width))
-    precise = partial(jnp.einsum, precision=jax.lax.Precision.HIGHEST)
-    return precise("jw,...iwc->...ijc", columns, precise("ih,...hwc->...iwc", rows, images))
-
-
-def _blur_matrix(size: int, border: Border) -> np.ndarray:
+@jax.custom_jvp
+def _blur(images: Float[Array, "*B H W C"]) -> Float[Array, "*B H W C"]:
+    """The mean in a Gaussian window around each pixel, zeros beyond the image."""
     offsets = np.arange(-RADIUS, RADIUS + 1)
     window = np.exp(-0.5 * (offsets / SIGMA) ** 2)
     window /= window.sum()
-    beyond = np.pad(np.eye(size), ((RADIUS, RADIUS), (0, 0)), "constant" if border == "zero" else "symmetric")
-    return sum(weight * beyond[k : k + size] for k, weight in enumerate(window))
+
+    def along(axis: int, x: Float[Array, "*B H W C"]) -> Float[Array, "*B H W C"]:
+        padded = jnp.pad(x, [(RADIUS, RADIUS) if k == x.ndim + axis else (0, 0) for k in range(x.ndim)])
+        shifted = (jax.lax.slice_in_dim(padded, k, k + x.shape[axis], axis=axis) for k in range(len(window)))
+        return sum((float(weight) * image for weight, image in zip(window, shifted, strict=True)), jnp.zeros_like(x))
+
+    # Without the barrier XLA merges the two passes of 11 values each into one of 121.
+    return along(-2, jax.lax.optimization_barrier(along(-3, images)))
+
+
+@_blur.defjvp
+def _blur_jvp(primals, tangents):
+    # A symmetric window is its own transpose; the transpose of slices is a slow sum of padded images.
+    return _blur(*primals), linear_call(lambda _, x: _blur(x), lambda _, x: _blur(x), (), *tangents)
 
 
 _ssim, _masked_ssim, _psnr = jax.jit(ssim), jax.jit(masked_ssim), jax.jit(psnr)
