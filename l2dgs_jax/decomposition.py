@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from l2dgs_jax.native import widen
 from l2dgs_jax.networks import apply_bafe
 from l2dgs_jax.types import BAFENet, Decomposition
 
@@ -24,8 +25,8 @@ def decompose(features: Float[Array, "*B H W 6"], bafe: BAFENet) -> Decompositio
     reflectance = clip_unit(features[..., 1:4])
     attenuation = apply_bafe(bafe, features[..., 4:6])
     return Decomposition(
-        welllit=illumination[..., None] * reflectance,
-        lowlight=power(illumination, attenuation[..., 1])[..., None] * power(reflectance, attenuation[..., :1]),
+        welllit=widen(illumination, 3) * reflectance,
+        lowlight=widen(power(illumination, attenuation[..., 1]), 3) * power(reflectance, widen(attenuation[..., 0], 3)),
         illumination=illumination,
         reflectance=reflectance,
         attenuation=attenuation,

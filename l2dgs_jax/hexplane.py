@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from l2dgs_jax.config import ModelConfig
+from l2dgs_jax.native import widen
 from l2dgs_jax.types import HexPlane
 
 # Axes (x, y, z = 0, 1, 2) of the space planes XY, YZ, ZX, and the axis of the time planes Zt, Xt, Yt paired with them.
@@ -73,7 +74,7 @@ def features(
     scales = []
     for space, time in zip(planes.space, planes.time, strict=True):
         low, weight = _cell(unit, space.shape[2])
-        weights = [_widen(weight[:, axis], space.shape[3]) for axis in range(3)]
+        weights = [widen(weight[:, axis], space.shape[3]) for axis in range(3)]
         in_space = _space_lookup(space, low, weights)
         # Views in a Python loop: broadcasting one over the other transposes to a sum over views, which is slow.
         at_times = [_aggregate(in_space, lines, cfg) for lines in _time_lookup(time, low, weights, times)]
@@ -107,15 +108,6 @@ def _cell(unit: Float[Array, "*S"], size: int) -> tuple[Int[Array, "*S"], Float[
     position = unit * (size - 1)
     low = jnp.clip(jnp.floor(position).astype(jnp.int32), 0, size - 2)
     return low, position - low.astype(position.dtype)
-
-
-def _widen(weight: Float[Array, " N"], channels: int) -> Float[Array, "N C"]:
-    """A weight repeated for each channel.
-
-    A matrix product, not a broadcast, because of its transpose: XLA's CPU reduction over a few channels costs more than
-    everything else in the lookup. "highest" keeps the weights exact where products round their factors.
-    """
-    return jnp.matmul(weight[:, None], jnp.ones((1, channels), weight.dtype), precision="highest")
 
 
 def _lerp(start: Float[Array, "*S"], end: Float[Array, "*S"], weight: Float[Array, "*S"]) -> Float[Array, "*S"]:

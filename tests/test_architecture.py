@@ -11,6 +11,7 @@ ORDER = [
     "errors",
     "files",
     "types",
+    "native",
     "config",
     "tone",
     "data",

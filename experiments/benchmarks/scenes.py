@@ -56,7 +56,6 @@ def training(count: int, width: int, height: int, config: Config, *, frames: int
     )
     noise = rng.uniform(0, 0.2, (height, width, 3)).astype(np.float16)
     split = Split(tuple(map(str, range(frames))), cameras, np.broadcast_to(noise, (frames, *noise.shape)))
-    config = engine.resolve(config, split)
     scene = engine.initial_state(Dataset("cloud", width, height, split, split, arrays["means"]), config).scene
     rows = partial(pad_rows, capacity=len(scene.alive))
     gaussians = scene.params.gaussians._replace(

@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from l2dgs_jax.native import add_rows_in_turn, one_function
 from l2dgs_jax.rasterizer.intersect import MIN_ALPHA, TILE, TileLists, grid
-from l2dgs_jax.rasterizer.native import add_rows_in_turn, one_function
 
 MAX_ALPHA = 0.999
 MIN_TRANSMITTANCE = 1e-4  # a Gaussian that would leave this little light ends its pixel and is left out

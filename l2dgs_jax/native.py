@@ -1,4 +1,4 @@
-"""Loops that XLA's CPU compiler turns into one native function."""
+"""What XLA's CPU compiler compiles together, and what apart."""
 
 from collections.abc import Callable
 from typing import TypeVar
@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, Int
 
 T = TypeVar("T")
 
-# The attributes of `one_function` are XLA's own: only the compilers that were tried with them are given them.
+# The attributes below are XLA's own: only the compilers that were tried with them are given them.
 TRIED = jaxlib.__version__.startswith("0.10.")
 
 
@@ -26,12 +26,19 @@ def one_function(function: Callable[..., T]) -> Callable[..., T]:
     if not TRIED:
         return function
 
-    def call(*arguments):
-        leaves, structure = jax.tree.flatten(jax.jit(function)(*arguments))
-        leaves = set_xla_metadata(leaves, xla_cpu_small_call="true", inlineable="false")
-        return jax.tree.unflatten(structure, leaves)
+    return _call(function, xla_cpu_small_call="true", inlineable="false")
 
-    return call
+
+def apart(function: Callable[..., T]) -> Callable[..., T]:
+    """The same function, on CPU never merged with what calls it.
+
+    Otherwise XLA computes a value again for each value that is computed from it, where it believes that memory costs
+    more. An optimization barrier does not help: it is gone before operations are merged.
+    """
+    if not TRIED:
+        return function
+    separate = _call(function, inlineable="false")
+    return lambda *arguments: jax.lax.platform_dependent(*arguments, cpu=separate, default=function)
 
 
 def add_rows_in_turn(
@@ -46,3 +53,21 @@ def add_rows_in_turn(
         return jax.lax.dynamic_update_slice(table, row, place)
 
     return jax.lax.fori_loop(jnp.int32(0), jnp.int32(ids.shape[0]), add, table)
+
+
+def widen(x: Float[Array, "*S"], channels: int) -> Float[Array, "*S C"]:
+    """`x` repeated along a new last axis; carries gradients.
+
+    A matrix product, not a broadcast, because of its transpose: a sum over a few channels is slow on CPU. "highest"
+    keeps the values exact where products round their factors.
+    """
+    ones = jnp.ones((1, channels), x.dtype)
+    return jnp.matmul(x.reshape(-1, 1), ones, precision="highest").reshape(*x.shape, channels)
+
+
+def _call(function: Callable[..., T], **attributes: str) -> Callable[..., T]:
+    def call(*arguments):
+        leaves, structure = jax.tree.flatten(jax.jit(function)(*arguments))
+        return jax.tree.unflatten(structure, set_xla_metadata(leaves, **attributes))
+
+    return call
