@@ -15,6 +15,7 @@ from l2dgs_jax import cli, runs
 from l2dgs_jax.data.dataset import Split
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.files import replacing
+from l2dgs_jax.rendering import in_order
 from l2dgs_jax.runs import Run
 from l2dgs_jax.types import RenderOutput
 from l2dgs_jax.visualize import expected_depth, to_bytes, view, write_image
@@ -78,8 +79,8 @@ def write_views(run: Run, split: Split, folder: Path) -> None:
 def views(run: Run, split: Split) -> Iterator[RenderOutput]:
     """Render the views of `split` in order, as NumPy arrays, showing progress."""
     renderer = run.renderer()
-    for index in tqdm(range(len(split.names)), desc="render", unit="view", dynamic_ncols=True):
-        yield jax.device_get(renderer(view(split.cameras, index)))
+    outputs = in_order(lambda i: jax.device_get(renderer(view(split.cameras, i))), range(len(split.names)))
+    yield from tqdm(outputs, total=len(split.names), desc="render", unit="view", dynamic_ncols=True)
 
 
 def choose_split(run: Run, name: str) -> Split:

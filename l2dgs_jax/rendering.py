@@ -1,11 +1,15 @@
 """Scene, camera, instant -> images: the one function that training and every tool call."""
 
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from l2dgs_jax.config import ModelConfig
 from l2dgs_jax.decomposition import decompose
@@ -13,6 +17,10 @@ from l2dgs_jax.deformation import deform
 from l2dgs_jax.rasterizer import rasterize
 from l2dgs_jax.scene import rung
 from l2dgs_jax.types import Camera, RenderOutput, Scene
+
+T = TypeVar("T")
+U = TypeVar("U")
+Drawn = TypeVar("Drawn", "RenderOutput", "_WellLit")
 
 
 def render(
@@ -81,9 +89,18 @@ class Renderer:
 
     def __call__(self, camera: Camera) -> RenderOutput:
         """Render one camera (no batch axis); the output has none either."""
+        output = self._fitting(_render, camera)
+        images = jax.tree.map(lambda x: x[0], output.images)
+        return output._replace(images=images, alpha=output.alpha[0], depth=output.depth[0], radii=output.radii[0])
+
+    def welllit(self, camera: Camera) -> Float[Array, "H W 3"]:
+        """Only I_w of one camera: without the low-light image, BAFE-Net need not run."""
+        return self._fitting(_render_welllit, camera).image[0]
+
+    def _fitting(self, draw: Callable[..., Drawn], camera: Camera) -> Drawn:
         cameras = jax.tree.map(lambda x: jnp.asarray(x, float)[None], camera)
         while True:
-            output = _render(
+            output = draw(
                 self.scene,
                 cameras,
                 self.cfg,
@@ -94,11 +111,33 @@ class Renderer:
                 pair_capacity=self.pair_capacity,
             )
             if not output.overflow:
-                images = jax.tree.map(lambda x: x[0], output.images)
-                return output._replace(
-                    images=images, alpha=output.alpha[0], depth=output.depth[0], radii=output.radii[0]
-                )
+                return output
             self.pair_capacity = rung(1.2 * float(output.pairs))
 
 
-_render = partial(jax.jit, static_argnames=("cfg", "width", "height", "moving", "pair_capacity"))(render)
+def in_order(function: Callable[[T], U], items: Iterable[T], workers: int = 2) -> Iterator[U]:
+    """`map`, a few items at once in threads: what one frame leaves idle of a processor, the next one uses."""
+    with ThreadPoolExecutor(workers) as pool:
+        waiting: deque[Future[U]] = deque()
+        for item in items:
+            waiting.append(pool.submit(function, item))
+            if len(waiting) > workers:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
+
+
+class _WellLit(NamedTuple):
+    image: Float[Array, "V H W 3"]
+    pairs: Int[Array, ""]
+    overflow: Bool[Array, ""]
+
+
+_STATIC = ("cfg", "width", "height", "moving", "pair_capacity")
+_render = partial(jax.jit, static_argnames=_STATIC)(render)
+
+
+@partial(jax.jit, static_argnames=_STATIC)
+def _render_welllit(*arguments, **options) -> _WellLit:
+    output = render(*arguments, **options)
+    return _WellLit(output.images.welllit, output.pairs, output.overflow)

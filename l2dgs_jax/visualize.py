@@ -15,6 +15,7 @@ from tqdm import tqdm
 
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.files import replacing
+from l2dgs_jax.rendering import in_order
 from l2dgs_jax.runs import Run
 from l2dgs_jax.types import Camera, RenderOutput
 
@@ -78,8 +79,8 @@ def video(run: Run, path: Path) -> None:
     """
     cameras = space_time_path(run.dataset.train.cameras, VIDEO_SECONDS * VIDEO_RATE)
     renderer = run.renderer()
-    steps = tqdm(range(len(cameras.time)), desc="video", unit="frame", dynamic_ncols=True)
-    outputs = (renderer(view(cameras, i)).images for i in steps)
+    frames = in_order(lambda i: renderer(view(cameras, i)).images, range(len(cameras.time)))
+    outputs = tqdm(frames, total=len(cameras.time), desc="video", unit="frame", dynamic_ncols=True)
     write_video(path, (to_bytes(np.hstack([x.lowlight, x.welllit])) for x in outputs), VIDEO_RATE)
 
 

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from l2dgs_jax.projection import Projected
+from l2dgs_jax.rasterizer.sorting import argsort, group
 
 TILE = 8  # pixels
 MIN_ALPHA = 1 / 255  # fainter contributions are skipped
@@ -89,21 +90,6 @@ def _touches(
     return ~(jnp.minimum(along_x, along_y) > reach)
 
 
-def _sorted(
-    tiles: Int[Array, " M"], ranks: Int[Array, " M"], tile_count: int, rank_count: int
-) -> tuple[Int[Array, " M"], Int[Array, " M"], Int[Array, " T1"]]:
-    """Pairs sorted by (tile, rank), and where each tile starts. Tile number `tile_count` collects the dropped pairs."""
-    bits = rank_count.bit_length()
-    borders = jnp.arange(tile_count + 1, dtype=jnp.uint32)
-    if bits + tile_count.bit_length() > 32:
-        tiles, ranks = jax.lax.sort((tiles, ranks), num_keys=2)
-        return tiles, ranks, jnp.searchsorted(tiles, borders.astype(tiles.dtype)).astype(jnp.int32)
-    # One key of 32 bits sorts several times faster than a key with a payload.
-    keys = jnp.sort((tiles.astype(jnp.uint32) << bits) | ranks.astype(jnp.uint32))
-    tiles, ranks = (keys >> bits).astype(jnp.int32), (keys & (2**bits - 1)).astype(jnp.int32)
-    return tiles, ranks, jnp.searchsorted(keys, borders << bits).astype(jnp.int32)
-
-
 def intersect(projected: Projected, boxes: Footprints, width: int, height: int, capacity: int) -> TileLists:
     """List the Gaussians of every tile of every view, sorted by depth; carries no gradients.
 
@@ -119,7 +105,7 @@ def intersect(projected: Projected, boxes: Footprints, width: int, height: int, 
     views, count = boxes.reach.shape
     columns, rows = grid(width, height)
     tiles = columns * rows
-    order = jnp.argsort(projected.depths, axis=-1).astype(jnp.int32)
+    order = jax.vmap(argsort)(projected.depths)
     order = (order + count * jnp.arange(views, dtype=jnp.int32)[:, None]).reshape(-1)
     nearest_first = lambda x: x.reshape(views * count, *x.shape[2:])[order]
 
@@ -137,6 +123,6 @@ def intersect(projected: Projected, boxes: Footprints, width: int, height: int, 
     kept = (pair < ends[-1]) & _touches(shape[:, :2], shape[:, 2:5], shape[:, 5], corner)
     tile = jnp.where(kept, slot // count * tiles + row * columns + column, views * tiles)
 
-    tile, rank, starts = _sorted(tile, slot % count, views * tiles, count)
+    tile, rank, starts = group(tile, slot % count, views * tiles, count)
     slot = jnp.minimum(tile // tiles, views - 1) * count + rank
     return TileLists(order[jnp.minimum(slot, views * count - 1)], starts[:-1], starts[1:])
