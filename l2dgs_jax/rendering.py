@@ -103,9 +103,9 @@ class Renderer:
             output = draw(
                 self.scene,
                 cameras,
-                self.cfg,
-                self.width,
-                self.height,
+                cfg=self.cfg,
+                width=self.width,
+                height=self.height,
                 moving=self.moving,
                 sh_degree=self.sh_degree,
                 pair_capacity=self.pair_capacity,
