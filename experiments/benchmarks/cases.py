@@ -65,6 +65,26 @@ def growth() -> Figures:
     return figures
 
 
+def folding() -> Figures:
+    """Scenes drawn in one vmapped call with their gradients, next to one scene: one of the four holds most pairs."""
+    width, height, counts = 160, 96, (10_000, 1_000, 1_000, 1_000)
+    scenes = [{name: jnp.asarray(x) for name, x in cloud(max(counts), width, height, seed=i).items()} for i in range(4)]
+    for scene, count in zip(scenes, counts, strict=True):
+        scene["opacities"] = scene["opacities"].at[count:].set(0)
+    names = ("means", "quats", "scales", "opacities", "features", "viewmat", "K")
+    capacity = engine.rung(max(int(rasterize(*(s[n] for n in names), width, height).pairs) for s in scenes))
+
+    def loss(*x):
+        return sum(jnp.vdot(image, image) for image in rasterize(*x, width, height, pair_capacity=capacity)[:3])
+
+    gradient = jax.value_and_grad(loss, range(5))
+    one, vmapped = jax.jit(gradient), jax.jit(jax.vmap(gradient))
+    apart = [tuple(scene[name] for name in names) for scene in scenes]
+    together = jax.tree.map(lambda *x: jnp.stack(x), *apart)
+    times = best_of(lambda: [one(*x) for x in apart]), best_of(lambda: vmapped(*together))
+    return {"one_by_one_ms": times[0], "vmapped_ms": times[1], "vmapped_over_one_by_one": times[1] / times[0]}
+
+
 def parts() -> Figures:
     """The parts of a fine step, each with its gradient: 40 k Gaussians, two views of 400x225."""
     width, height = 400, 225
@@ -145,7 +165,7 @@ def memory() -> Figures:
 
 
 CASES: dict[str, Callable[[], Figures]] = {
-    case.__name__: case for case in (rasterizer, growth, parts, step, rendering, compiling, memory)
+    case.__name__: case for case in (rasterizer, growth, folding, parts, step, rendering, compiling, memory)
 }
 
 
@@ -198,7 +218,10 @@ def _stepper(count: int, width: int, height: int) -> Callable[[], Any]:
 
 def _child(name: str, *arguments: str) -> str:
     """What a function of this module prints in a process of its own."""
-    program = f"import sys; from experiments.benchmarks import cases; cases._{name}(*sys.argv[1:])"
+    program = (
+        "import sys; from experiments.benchmarks import cases; from l2dgs_jax.cli import keep_freed_memory; "
+        f"keep_freed_memory(); cases._{name}(*sys.argv[1:])"
+    )
     done = subprocess.run([sys.executable, "-c", program, *arguments], check=True, capture_output=True, text=True)
     return done.stdout.split()[-1]
 
