@@ -128,6 +128,20 @@ def test_an_image_of_one_pixel():
     assert all(np.all(np.isfinite(x)) and np.any(x != 0) for x in gradients)
 
 
+def test_the_form_for_accelerators_agrees(monkeypatch):
+    arrays = scene(13)
+    values, gradients = fast(*arrays)
+    monkeypatch.setattr(jax.lax, "platform_dependent", lambda *x, cpu, default: default(*x))
+
+    def draw(*arrays, width, height):  # with a capacity of its own, or the compiled CPU form would be found and run
+        output = rasterize(*arrays, width, height, pair_capacity=CAPACITY + 1)
+        return output.features, output.alpha, output.depth
+
+    general_values, general_gradients = with_gradients(draw)(*arrays)
+    assert_close(general_values, values, 1e-12)
+    assert_close(general_gradients, gradients, 1e-11)
+
+
 # One tile, as many tiles as a block of either kind, one more than that, and a few blocks with a remainder.
 @pytest.mark.parametrize(("width", "height"), [(8, 8), (32, 16), (72, 8), (33, 39)])
 def test_tiles_that_fill_blocks_or_do_not(width, height):
