@@ -16,6 +16,7 @@ from l2dgs_jax.config import Config
 from l2dgs_jax.data.batching import view_indices
 from l2dgs_jax.data.dataset import Dataset, Split
 from l2dgs_jax.density import GrowthStats
+from l2dgs_jax.rasterizer import count_pairs
 from l2dgs_jax.rendering import render
 from l2dgs_jax.scene import groups, initialise, observed_colors, pad_rows, rung
 from l2dgs_jax.tone import Darkening, darkening
@@ -25,6 +26,9 @@ with warnings.catch_warnings():
     warnings.simplefilter("ignore", DeprecationWarning)  # jaxopt announces that it is unmaintained
     from jaxopt import OptaxSolver
     from jaxopt._src.optax_wrapper import OptaxState
+
+
+MARGIN = 1.3  # of the pair buffer over what was last needed: every size is a compilation
 
 
 class Batch(NamedTuple):
@@ -217,7 +221,7 @@ def run(split: Split, config: Config, state: TrainState, pair_capacity: int | No
     Raises:
         DivergedError: loss or gradient of a step are not finite.
     """
-    pair_capacity = pair_capacity or rung(4 * config.batch_size * state.scene.alive.shape[0])
+    pair_capacity = pair_capacity or first_capacity(split, config, state.scene)
     for step in range(int(state.step), config.steps):
         moving = step >= config.coarse_steps
         stage_start = config.coarse_steps if moving else 0
@@ -229,7 +233,7 @@ def run(split: Split, config: Config, state: TrainState, pair_capacity: int | No
             state, report = train_step(state, batch, config, moving=moving, pair_capacity=pair_capacity)
             if not report.overflow:
                 break
-            pair_capacity = rung(1.3 * float(report.pairs))
+            pair_capacity = rung(MARGIN * float(report.pairs))
         if not report.finite:
             terms = ", ".join(f"{name} {float(value):.3g}" for name, value in report.terms.items())
             raise DivergedError(f"the loss or its gradient is not finite at step {step} ({terms})")
@@ -237,6 +241,18 @@ def run(split: Split, config: Config, state: TrainState, pair_capacity: int | No
         if density_due(step + 1 - stage_start, config):
             state = densify(state, config)
         yield Progress(state, report, pair_capacity)
+
+
+def first_capacity(split: Split, config: Config, scene: Scene) -> int:
+    """A pair buffer for a batch of the first views, their Gaussians at rest, with a margin for the others."""
+    gaussians = scene.params.gaussians
+    batch = load_batch(split, np.arange(config.batch_size) % len(split.names))
+    cameras = jax.tree.map(lambda x: jnp.asarray(x, gaussians.means.dtype), batch.cameras)
+    height, width = split.images.shape[1:3]
+    opacities = jnp.where(scene.alive, jax.nn.sigmoid(gaussians.logit_opacities), 0)
+    rows = (gaussians.means, gaussians.quats, jnp.exp(gaussians.log_scales), opacities)
+    per_view = (jnp.broadcast_to(x[None], (config.batch_size, *x.shape)) for x in rows)
+    return rung(MARGIN * float(count_pairs(*per_view, cameras.viewmat, cameras.K, width, height)))
 
 
 def load_batch(split: Split, indices: Int[np.ndarray, " V"]) -> Batch:

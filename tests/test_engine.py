@@ -186,6 +186,21 @@ def test_dead_rows_are_inert(dataset):
         np.testing.assert_array_equal(y[rows:], 0)
 
 
+def test_the_first_pair_buffer_fits_the_first_views(dataset):
+    config = tiny()
+    scene = engine.with_capacity(engine.initial_state(dataset, config), 1500).scene
+    gaussians = scene.params.gaussians
+    everywhere = gaussians._replace(
+        means=jnp.zeros_like(gaussians.means).at[:, 2].set(2), log_scales=jnp.ones_like(gaussians.log_scales)
+    )
+    scene = scene._replace(params=scene.params._replace(gaussians=everywhere))
+    tiles = 2 * 2
+    for alive in (1000, 1500):
+        scene = scene._replace(alive=jnp.arange(1500) < alive)
+        capacity = engine.first_capacity(dataset.train, config, scene)
+        assert capacity == engine.rung(1.3 * alive * tiles * config.batch_size)
+
+
 def test_the_fine_stage_starts_where_the_coarse_one_ended(dataset):
     config = tiny()
     state = engine.initial_state(dataset, config)

@@ -4,7 +4,7 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from l2dgs_jax.projection import Projected, project
 from l2dgs_jax.rasterizer.composite import composite
@@ -57,7 +57,8 @@ def rasterize(
         arrays = jax.tree.map(lambda x: x[None], arrays)
     if pair_capacity is None:
         try:
-            needed = int(_count(*jax.lax.stop_gradient(arrays), width, height))
+            geometry = jax.lax.stop_gradient((*arrays[:4], *arrays[5:]))
+            needed = int(count_pairs(*geometry[:6], width, height, geometry[6]))
         except jax.errors.ConcretizationTypeError:
             raise ValueError("rasterize needs a static pair_capacity under jit or vmap") from None
         # Three significant bits: at most a quarter of the room is wasted, and few sizes are ever compiled.
@@ -76,9 +77,21 @@ def _prepare(means, quats, scales, opacities, viewmat, K, probe, width, height) 
     return projected, footprints(*jax.lax.stop_gradient((projected, opacities)), width, height)
 
 
-@partial(jax.jit, static_argnums=(8, 9))
-def _count(means, quats, scales, opacities, features, viewmat, K, probe, width, height):
-    return pairs_needed(_prepare(means, quats, scales, opacities, viewmat, K, probe, width, height)[1])
+@partial(jax.jit, static_argnames=("width", "height"))
+def count_pairs(
+    means: Float[Array, "V N 3"],
+    quats: Float[Array, "V N 4"],
+    scales: Float[Array, "V N 3"],
+    opacities: Float[Array, "V N"],
+    viewmat: Float[Array, "V 4 4"],
+    K: Float[Array, "V 3 3"],
+    width: int,
+    height: int,
+    means2d_probe: Float[Array, "V N 2"] | None = None,
+) -> Int[Array, ""]:
+    """The `pair_capacity` that `rasterize` needs for the same arguments, at most 2^31 - 1."""
+    boxes = _prepare(means, quats, scales, opacities, viewmat, K, means2d_probe, width, height)[1]
+    return pairs_needed(boxes)
 
 
 @partial(jax.jit, static_argnums=(8, 9, 10))
