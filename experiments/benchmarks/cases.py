@@ -152,10 +152,13 @@ def rendering() -> Figures:
 
 
 def compiling() -> Figures:
-    """Time to the end of the first fine step in a new process, cache empty and then filled."""
-    with tempfile.TemporaryDirectory() as folder:
-        cold, cached = (float(_child("first_step", folder)) for _ in range(2))
-    return {"cold_s": cold, "cached_s": cached}
+    """Time to the end of a stage's first step in a new process, cache empty and then filled."""
+    figures = {}
+    for stage in ("coarse", "fine"):
+        with tempfile.TemporaryDirectory() as folder:
+            for cache in ("cold", "cached"):
+                figures[f"{stage}_{cache}_s"] = float(_child("first_step", folder, stage))
+    return figures
 
 
 def memory() -> Figures:
@@ -200,11 +203,11 @@ def _pairs(moved: MovedGaussians, channels: jax.Array, cameras: Camera, width: i
     return int(rasterize(*geometry, channels, cameras.viewmat, cameras.K, width, height).pairs)
 
 
-def _stepper(count: int, width: int, height: int) -> Callable[[], Any]:
-    """Takes the next training step at every call; the pair buffer fits from the first on."""
+def _stepper(count: int, width: int, height: int, margin: float = 1.1) -> Callable[[], Any]:
+    """Takes the next training step at every call; the pair buffer holds `margin` times what the first one needs."""
     state, batch = training(count, width, height, CONFIG)
     moved = _move(state.scene, batch.cameras)
-    capacity = engine.rung(1.1 * _pairs(moved, moved.reflectance, batch.cameras, width, height))
+    capacity = engine.rung(margin * _pairs(moved, moved.reflectance, batch.cameras, width, height))
 
     def take():
         nonlocal state
@@ -226,12 +229,13 @@ def _child(name: str, *arguments: str) -> str:
     return done.stdout.split()[-1]
 
 
-def _first_step(folder: str) -> None:
+def _first_step(folder: str, stage: str) -> None:
     jax.config.update("jax_compilation_cache_dir", folder)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
     state, batch = training(7_000, 200, 112, CONFIG)
     start = time.perf_counter()
-    jax.block_until_ready(engine.train_step(state, batch, CONFIG, moving=True, pair_capacity=engine.rung(200_000)))
+    moving, capacity = stage == "fine", engine.rung(200_000)
+    jax.block_until_ready(engine.train_step(state, batch, CONFIG, moving=moving, pair_capacity=capacity))
     print(time.perf_counter() - start)
 
 
@@ -243,7 +247,7 @@ def _large_steps() -> None:
 
 
 def _thousand_steps() -> None:
-    take = _stepper(1_000, 96, 64)
+    take = _stepper(1_000, 96, 64, margin=4)
     for _ in range(100):
         take()
     before = resident_memory()
