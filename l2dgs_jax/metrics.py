@@ -6,7 +6,6 @@ from typing import Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.custom_derivatives import linear_call
 from jaxtyping import Array, Bool, Float
 
 from l2dgs_jax.native import apart
@@ -85,7 +84,7 @@ def ssim_map(
 ) -> Float[Array, "*B H W C"]:
     """Structural similarity around each pixel, in an 11x11 Gaussian window of sigma 1.5, per channel.
 
-    Source: Wang et al. 2004 with the population covariance. Gradients flow to both images.
+    Source: Wang et al. 2004 with the population covariance. Gradients flow to both images, reverse mode only.
 
     Args:
         a: image with values in [0, 1].
@@ -152,13 +151,9 @@ def _window_mean(images: Float[Array, "*B H W C"]) -> Float[Array, "*B H W C"]:
     return along(-2, along(-3, images))
 
 
-_blur = jax.custom_jvp(apart(_window_mean))
-
-
-@_blur.defjvp
-def _blur_jvp(primals, tangents):
-    # A symmetric window is its own transpose; the transpose of slices is a slow sum of padded images.
-    return _blur(*primals), linear_call(lambda _, x: _blur(x), lambda _, x: _blur(x), (), *tangents)
+_blur = jax.custom_vjp(apart(_window_mean))
+# A symmetric window is its own transpose; the transpose of slices would be a slow sum of padded images.
+_blur.defvjp(lambda images: (_blur(images), None), lambda _, cotangent: (_blur(cotangent),))
 
 
 _ssim, _masked_ssim, _psnr = jax.jit(ssim), jax.jit(masked_ssim), jax.jit(psnr)

@@ -52,8 +52,8 @@ def constant_render(value, height, width, dtype):
     return render._replace(images=images, depth=jnp.full_like(render.depth, value))
 
 
-def grads_agree(function, *arguments):
-    check_grads(jax.jit(function), arguments, order=1, modes=("fwd", "rev"), eps=1e-6, atol=1e-6, rtol=1e-5)
+def grads_agree(function, *arguments, modes=("fwd", "rev")):
+    check_grads(jax.jit(function), arguments, order=1, modes=modes, eps=1e-6, atol=1e-6, rtol=1e-5)
 
 
 # Plain transcriptions of the equations, a loop over pixels each.
@@ -160,7 +160,7 @@ def test_ssim_is_the_second_term_of_eq_10():
     a, b = uniform(0, V, H, W, 3), uniform(1, V, H, W, 3)
     tone_a, tone_b = ((np.asarray(x) + EPS) ** 0.7 for x in (a, b))
     close(losses.photometric_ssim(a, b, 0.7, EPS), expected_ssim(tone_a, tone_b))
-    grads_agree(lambda a: losses.photometric_ssim(a, b, 0.7, EPS), a)
+    grads_agree(lambda a: losses.photometric_ssim(a, b, 0.7, EPS), a, modes=("rev",))
 
 
 @pytest.mark.parametrize("window", [3, 4, 16, None])
@@ -276,7 +276,7 @@ def test_gradients_of_the_total(cfg):
     def objective(images, depth):
         return losses.total(render._replace(images=images, depth=depth), target, cfg, 0.8, 1.2)[0]
 
-    grads_agree(objective, render.images, render.depth)
+    grads_agree(objective, render.images, render.depth, modes=("rev",))
 
 
 @pytest.mark.parametrize("cfg", [EVERY_TERM, AUTHORS], ids=["every term", "authors"])

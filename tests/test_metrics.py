@@ -71,7 +71,7 @@ def test_ssim_is_symmetric_and_lower_for_worse_images():
 @pytest.mark.parametrize("border", ["zero", "mirror"])
 def test_ssim_gradients(border):
     a, b = (jnp.asarray(x) for x in pair(5, 6, 7, 2))
-    check_grads(jax.jit(lambda a, b: ssim_map(a, b, border).mean()), (a, b), 1, ("fwd", "rev"), 1e-6, 1e-6, eps=1e-5)
+    check_grads(jax.jit(lambda a, b: ssim_map(a, b, border).mean()), (a, b), 1, ("rev",), 1e-6, 1e-6, eps=1e-5)
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 20), (4, 10), (10, 11)], ids=str)

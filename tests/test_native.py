@@ -9,7 +9,7 @@ from l2dgs_jax import native
 def test_rows_added_in_turn_are_a_scatter():
     random = np.random.default_rng(0)
     table, rows = jnp.asarray(random.normal(size=(7, 3))), jnp.asarray(random.normal(size=(4, 5, 3)))
-    ids = jnp.asarray(random.integers(0, 7, (4, 5)))  # 20 rows into 7: most are hit more than once
+    ids = jnp.asarray(random.integers(0, 7, (4, 5)), jnp.int32)  # 20 rows into 7: most are hit more than once
     added = jax.jit(native.one_function(native.add_rows_in_turn))(table, ids, rows)
     np.testing.assert_allclose(added, table.at[ids].add(rows), rtol=1e-14)
 
@@ -28,4 +28,4 @@ def test_what_is_compiled_together_or_apart_computes_the_same():
 def test_widen_repeats_and_its_gradient_sums():
     x = jnp.asarray(np.random.default_rng(1).normal(size=(2, 3)))
     np.testing.assert_array_equal(native.widen(x, 4), np.repeat(x[..., None], 4, axis=-1))
-    check_grads(lambda x: native.widen(x, 4) ** 2, (x,), order=1)
+    check_grads(jax.jit(lambda x: native.widen(x, 4) ** 2), (x,), order=1)
