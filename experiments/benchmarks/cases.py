@@ -20,7 +20,7 @@ from l2dgs_jax import engine, hexplane, losses, networks
 from l2dgs_jax.config import PRESETS
 from l2dgs_jax.decomposition import decompose
 from l2dgs_jax.deformation import deform
-from l2dgs_jax.rasterizer import rasterize
+from l2dgs_jax.rasterizer import count_pairs, rasterize
 from l2dgs_jax.rendering import Renderer, in_order
 from l2dgs_jax.types import Camera, MovedGaussians, RenderOutput, Scene
 
@@ -66,7 +66,7 @@ def growth() -> Figures:
 
 
 def folding() -> Figures:
-    """Scenes drawn in one vmapped call with their gradients, next to one scene: one of the four holds most pairs."""
+    """Four scenes drawn with their gradients in one vmapped call, next to one by one; the first holds most pairs."""
     width, height, counts = 160, 96, (10_000, 1_000, 1_000, 1_000)
     scenes = [{name: jnp.asarray(x) for name, x in cloud(max(counts), width, height, seed=i).items()} for i in range(4)]
     for scene, count in zip(scenes, counts, strict=True):
@@ -95,7 +95,7 @@ def parts() -> Figures:
     look = lambda p: hexplane.features(p.hexplane, p.gaussians.means, scene.bounds, batch.cameras.time, cfg)
     moved, field = move(params), jax.jit(look)(params)
     channels = jnp.concatenate([moved.illumination[..., None], moved.reflectance, moved.attenuation], axis=-1)
-    capacity = engine.rung(_pairs(moved, channels, batch.cameras, width, height))
+    capacity = engine.rung(_pairs(moved, batch.cameras, width, height))
 
     def draw(moved, channels):
         geometry = (moved.means, moved.quats, moved.scales, moved.opacities)
@@ -198,16 +198,16 @@ def _with_gradient(function: Callable, *arguments: Any) -> float:
     return best_of(lambda: gradient(*arguments), 7)
 
 
-def _pairs(moved: MovedGaussians, channels: jax.Array, cameras: Camera, width: int, height: int) -> int:
+def _pairs(moved: MovedGaussians, cameras: Camera, width: int, height: int) -> int:
     geometry = (moved.means, moved.quats, moved.scales, moved.opacities)
-    return int(rasterize(*geometry, channels, cameras.viewmat, cameras.K, width, height).pairs)
+    return int(count_pairs(*geometry, cameras.viewmat, cameras.K, width, height))
 
 
 def _stepper(count: int, width: int, height: int, margin: float = 1.1) -> Callable[[], Any]:
     """Takes the next training step at every call; the pair buffer holds `margin` times what the first one needs."""
     state, batch = training(count, width, height, CONFIG)
     moved = _move(state.scene, batch.cameras)
-    capacity = engine.rung(margin * _pairs(moved, moved.reflectance, batch.cameras, width, height))
+    capacity = engine.rung(margin * _pairs(moved, batch.cameras, width, height))
 
     def take():
         nonlocal state

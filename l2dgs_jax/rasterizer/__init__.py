@@ -57,8 +57,8 @@ def rasterize(
         arrays = jax.tree.map(lambda x: x[None], arrays)
     if pair_capacity is None:
         try:
-            geometry = jax.lax.stop_gradient((*arrays[:4], *arrays[5:]))
-            needed = int(count_pairs(*geometry[:6], width, height, geometry[6]))
+            *geometry, probe = jax.lax.stop_gradient((*arrays[:4], *arrays[5:]))
+            needed = int(count_pairs(*geometry, width, height, probe))
         except jax.errors.ConcretizationTypeError:
             raise ValueError("rasterize needs a static pair_capacity under jit or vmap") from None
         # Three significant bits: at most a quarter of the room is wasted, and few sizes are ever compiled.

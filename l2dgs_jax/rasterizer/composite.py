@@ -103,7 +103,10 @@ def _fold(function: Callable[..., Array]) -> Callable[..., Array]:
 
 
 def _in_blocks(draw, size, packed, lists, images, columns, rows):
-    """Call `draw` with the tiles in blocks. Sorting the tiles by length makes the lists of a block alike."""
+    """Call `draw` with the tiles in blocks. Sorting the tiles by length makes the lists of a block alike.
+
+    What comes of images is summed per Gaussian; without any it is drawn per tile, and put back in the tiles' order.
+    """
     count = lists.starts.shape[0]
     size = min(size, count)
     order = jnp.argsort(lists.starts - lists.stops).astype(jnp.int32)
