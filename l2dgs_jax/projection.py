@@ -28,18 +28,22 @@ class Projected(NamedTuple):
     visible: Bool[Array, "*B N"]
 
 
-def rotations(quats: Float[Array, "*B N 4"]) -> Float[Array, "N 3 3"]:
-    """Rotation matrices of quaternions (wxyz) of any norm; a zero quaternion is the identity and has no gradient."""
-    squared = jnp.sum(quats**2, axis=-1, keepdims=True)
+def rotations(quats: Float[Array, "N 4"]) -> Float[Array, "3 3 N"]:
+    """Rotation matrices of quaternions (wxyz) of any norm; a zero quaternion is the identity and has no gradient.
+
+    The Gaussians are the last axis: every entry is one vector, and arithmetic with entries is what CPUs are fast at.
+    """
+    w, x, y, z = quats.T
+    squared = w * w + x * x + y * y + z * z
     zero = squared <= 1e-24
-    unit = jnp.where(zero, 0, quats / jnp.sqrt(jnp.where(zero, 1, squared)))
-    w, x, y, z = unit[:, 0], unit[:, 1], unit[:, 2], unit[:, 3]
+    inverse_norm = jnp.where(zero, 0, 1 / jnp.sqrt(jnp.where(zero, 1, squared)))
+    w, x, y, z = (part * inverse_norm for part in (w, x, y, z))
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
-    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+    return jnp.stack([jnp.stack(row) for row in rows])
 
 
 def project(
@@ -76,24 +80,23 @@ def project(
     margin = FIELD_MARGIN * 0.5 * size / focal
     lowest, highest = -(centre / focal + margin), (size - centre) / focal + margin
     tx, ty = jnp.clip(normalised, lowest[None], highest[None]).T
-    zero = jnp.zeros_like(z)
-    jacobian = jnp.stack(
-        [
-            jnp.stack([focal[0] / z, zero, -focal[0] * tx / z], axis=-1),
-            jnp.stack([zero, focal[1] / z, -focal[1] * ty / z], axis=-1),
-        ],
-        axis=-2,
-    )
-    half = jacobian @ viewmat[None, :3, :3] @ (rotations(quats) * scales[:, None, :])
-    u, v = half[:, 0], half[:, 1]
-    xx, xy, yy = jnp.sum(u * u, axis=-1) + BLUR, jnp.sum(u * v, axis=-1), jnp.sum(v * v, axis=-1) + BLUR
+    turned, deviations = rotations(quats), scales.T
+
+    def half(focal, tangent, row):
+        """A row of J W R S, whose product with its transpose is the covariance."""
+        towards = [focal / z * (viewmat[row, axis] - tangent * viewmat[2, axis]) for axis in range(3)]
+        return [deviations[j] * sum(towards[k] * turned[k, j] for k in range(3)) for j in range(3)]
+
+    u, v = half(focal[0], tx, 0), half(focal[1], ty, 1)
+    dot = lambda p, q: sum(a * b for a, b in zip(p, q, strict=True))
+    xx, xy, yy = dot(u, u) + BLUR, dot(u, v), dot(v, v) + BLUR
     # Cauchy-Schwarz bounds the unblurred determinant by zero; the blur keeps this sum positive after rounding too.
     determinant = (xx - BLUR) * (yy - BLUR) - xy * xy
     determinant = jnp.maximum(determinant, 0) + BLUR * (xx + yy - BLUR)
     return Projected(
         means2d=means2d,
-        covariances2d=jnp.stack([xx, xy, yy], axis=-1),
-        conics=jnp.stack([yy, -xy, xx], axis=-1) / determinant[:, None],
+        covariances2d=jnp.stack([xx, xy, yy]).T,
+        conics=(jnp.stack([yy, -xy, xx]) / determinant[None]).T,
         depths=z,
         visible=visible,
     )

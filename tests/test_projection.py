@@ -17,7 +17,7 @@ NAMES = ("means", "quats", "scales", "viewmat", "K")
 def scene():
     """Six Gaussians before a camera that looks askew; some lie outside the image, where the Jacobian is clamped."""
     random = np.random.default_rng(3)
-    turn = np.asarray(rotations(jnp.asarray(random.normal(size=(1, 4))))[0])
+    turn = np.asarray(rotations(jnp.asarray(random.normal(size=(1, 4))))[..., 0])
     viewmat = np.eye(4)
     viewmat[:3, :3], viewmat[:3, 3] = turn, [0.1, -0.2, 0.3]
     seen = np.concatenate(
@@ -57,7 +57,7 @@ def test_covariance_is_the_pinhole_map_linearised(scene):
         pixel = K @ (viewmat[:3, :3] @ mean + viewmat[:3, 3])
         return pixel[:2] / pixel[2]
 
-    turned = rotations(quats)
+    turned = jnp.moveaxis(rotations(quats), -1, 0)
     covariances = turned @ (scales[:, :, None] ** 2 * jnp.swapaxes(turned, 1, 2))
     jacobians = jax.vmap(jax.jacfwd(pinhole))(means)
     expected = jacobians @ covariances @ jnp.swapaxes(jacobians, 1, 2) + 0.3 * jnp.eye(2)[None]
@@ -70,11 +70,11 @@ def test_covariance_is_the_pinhole_map_linearised(scene):
 
 def test_rotations_are_rotations_whatever_the_norm(scene):
     quats = scene[1]
-    turned = rotations(quats)
+    turned = jnp.moveaxis(rotations(quats), -1, 0)
     np.testing.assert_allclose(turned @ jnp.swapaxes(turned, 1, 2), np.tile(np.eye(3), (6, 1, 1)), atol=1e-12)
     np.testing.assert_allclose(jnp.linalg.det(turned), 1, rtol=1e-12)
-    np.testing.assert_allclose(rotations(-7 * quats), turned, atol=1e-12)
-    quarter = rotations(jnp.array([[1.0, 0.0, 0.0, 1.0]]))[0]
+    np.testing.assert_allclose(rotations(-7 * quats), rotations(quats), atol=1e-12)
+    quarter = rotations(jnp.array([[1.0, 0.0, 0.0, 1.0]]))[..., 0]
     np.testing.assert_allclose(quarter @ jnp.array([1.0, 0.0, 0.0]), [0, 1, 0], atol=1e-12)
 
 
