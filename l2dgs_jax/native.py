@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import jaxlib
 from jax.experimental.xla_metadata import set_xla_metadata
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, Shaped
 
 T = TypeVar("T")
 
@@ -39,6 +39,16 @@ def apart(function: Callable[..., T]) -> Callable[..., T]:
         return function
     separate = _call(function, inlineable="false")
     return lambda *arguments: jax.lax.platform_dependent(*arguments, cpu=separate, default=function)
+
+
+def read(array: Shaped[Array, " N"], i: Int[Array, ""]) -> Shaped[Array, ""]:
+    """`array[i]` with `i` clamped to the array."""
+    return jax.lax.dynamic_index_in_dim(array, i, keepdims=False)
+
+
+def write(array: Shaped[Array, " N"], i: Int[Array, ""], value: Shaped[Array, ""]) -> Shaped[Array, " N"]:
+    """`array.at[i].set(value)` with `i` clamped to the array, in the form that loops do in place."""
+    return jax.lax.dynamic_update_slice(array, value[None], (i,))
 
 
 def add_rows_in_turn(

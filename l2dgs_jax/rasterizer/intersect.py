@@ -1,11 +1,13 @@
 """Which Gaussians touch which tile, nearest first: culling, listing and sorting."""
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from l2dgs_jax.native import one_function, read, write
 from l2dgs_jax.projection import Projected
 from l2dgs_jax.rasterizer.sorting import argsort, group
 
@@ -73,20 +75,19 @@ def pairs_needed(boxes: Footprints) -> Int[Array, ""]:
     return jnp.where(jnp.sum(counts, dtype=jnp.float32) < most, jnp.sum(counts, dtype=jnp.int32), most)
 
 
-def _touches(
-    means2d: Float[Array, "M 2"], conics: Float[Array, "M 3"], reach: Float[Array, " M"], corner: Float[Array, "M 2"]
-) -> Bool[Array, " M"]:
-    """Whether an ellipse reaches a tile's rectangle of pixel centres, whose lowest corner is `corner`.
+def _touches(shape: tuple[Float[Array, "*S"], ...], x: Float[Array, "*S"], y: Float[Array, "*S"]) -> Bool[Array, "*S"]:
+    """Whether an ellipse (mean, conic, reach) reaches the pixel centres of the tile whose lowest one is (x, y).
 
     A convex quadratic takes its minimum over a rectangle that excludes its centre on one of the (at most two) sides
     that face the centre.
     """
-    low, high = corner - means2d, corner + (TILE - 1) - means2d
-    a, b, c = conics[:, 0], conics[:, 1], conics[:, 2]
+    mean_x, mean_y, a, b, c, reach = shape
+    low_x, low_y = x - mean_x, y - mean_y
+    high_x, high_y = low_x + (TILE - 1), low_y + (TILE - 1)
     q = lambda x, y: a * x * x + 2 * b * x * y + c * y * y
-    x, y = jnp.clip(0, low, high).T
-    along_y = q(x, jnp.clip(-b * x / c, low[:, 1], high[:, 1]))
-    along_x = q(jnp.clip(-b * y / a, low[:, 0], high[:, 0]), y)
+    near_x, near_y = jnp.clip(0, low_x, high_x), jnp.clip(0, low_y, high_y)
+    along_y = q(near_x, jnp.clip(-b * near_x / c, low_y, high_y))
+    along_x = q(jnp.clip(-b * near_y / a, low_x, high_x), near_y)
     return ~(jnp.minimum(along_x, along_y) > reach)
 
 
@@ -111,18 +112,61 @@ def intersect(projected: Projected, boxes: Footprints, width: int, height: int, 
 
     box = nearest_first(jnp.concatenate([boxes.first, boxes.counts], axis=-1))
     shape = nearest_first(jnp.concatenate([projected.means2d, projected.conics, boxes.reach[..., None]], axis=-1))
+    listing = {"views": views, "columns": columns, "rows": rows, "capacity": capacity}
+    forms = [partial(form, **listing) for form in (_list_in_turn, _list_at_once)]
+    # XLA aborts on an argument of `one_function` that its simplifications leave unused, as they might for one row.
+    cpu, default = forms if views * count > 1 else (forms[1], forms[1])
+    tile, slot = jax.lax.platform_dependent(box, shape, cpu=cpu, default=default)
+    tile, rank, starts = group(tile, slot % count, views * tiles, count)
+    slot = jnp.minimum(tile // tiles, views - 1) * count + rank
+    return TileLists(order[jnp.minimum(slot, views * count - 1)], starts[:-1], starts[1:])
+
+
+def _list_at_once(box, shape, *, views, columns, rows, capacity):
+    """For each pair its tile and the row of its Gaussian; pairs that do not touch have the tile after the last."""
+    count = box.shape[0]
     sizes = box[:, 2] * box[:, 3]
     ends = jnp.cumsum(sizes, dtype=jnp.int32)
-    slot = jnp.repeat(jnp.arange(views * count, dtype=jnp.int32), sizes, total_repeat_length=capacity)
+    slot = jnp.repeat(jnp.arange(count, dtype=jnp.int32), sizes, total_repeat_length=capacity)
     pair = jnp.arange(capacity, dtype=jnp.int32)
     box, shape = box[slot], shape[slot]
     within = pair - (ends - sizes)[slot]
     column_count = jnp.maximum(box[:, 2], 1)
     column, row = box[:, 0] + within % column_count, box[:, 1] + within // column_count
-    corner = TILE * jnp.stack([column, row], axis=-1).astype(shape.dtype) + 0.5
-    kept = (pair < ends[-1]) & _touches(shape[:, :2], shape[:, 2:5], shape[:, 5], corner)
-    tile = jnp.where(kept, slot // count * tiles + row * columns + column, views * tiles)
+    x, y = (TILE * place.astype(shape.dtype) + 0.5 for place in (column, row))
+    kept = (pair < ends[-1]) & _touches(tuple(shape.T), x, y)
+    first = slot // (count // views) * (columns * rows)
+    return jnp.where(kept, first + row * columns + column, views * columns * rows), slot
 
-    tile, rank, starts = group(tile, slot % count, views * tiles, count)
-    slot = jnp.minimum(tile // tiles, views - 1) * count + rank
-    return TileLists(order[jnp.minimum(slot, views * count - 1)], starts[:-1], starts[1:])
+
+def _list_in_turn(box, shape, *, views, columns, rows, capacity):
+    """The same pairs by a loop over the Gaussians; those that touch take the first places."""
+    count = box.shape[0] // views
+    nowhere = views * columns * rows
+
+    def listed(box, shape):
+        def list_gaussian(slot, state):
+            left, top, width, height = (read(column, slot) for column in box)
+            ellipse = tuple(read(column, slot) for column in shape)
+            first = slot // count * (columns * rows)
+
+            def list_tile(row, column, state):
+                end, tiles, slots = state
+                x, y = (TILE * place.astype(ellipse[0].dtype) + 0.5 for place in (column, row))
+                # What does not touch is overwritten by the next pair that does; the place after the last is spare.
+                tiles = write(tiles, end, first + row * columns + column)
+                slots = write(slots, end, slot)
+                return jnp.minimum(end + _touches(ellipse, x, y).astype(jnp.int32), capacity), tiles, slots
+
+            in_row = lambda row, state: loop(left, left + width, partial(list_tile, row), state)
+            return loop(top, top + height, in_row, state)
+
+        loop = jax.lax.fori_loop
+        tiles = jnp.full(capacity + 1, nowhere, jnp.int32)
+        end, tiles, slots = loop(
+            jnp.int32(0), jnp.int32(box[0].shape[0]), list_gaussian, (jnp.int32(0), tiles, jnp.zeros_like(tiles))
+        )
+        return write(tiles, end, jnp.int32(nowhere))[:capacity], slots[:capacity]
+
+    columns_of = lambda x: tuple(x.T)
+    return jax.custom_batching.sequential_vmap(one_function(listed))(columns_of(box), columns_of(shape))

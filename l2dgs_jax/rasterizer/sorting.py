@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from l2dgs_jax.native import apart, one_function
+from l2dgs_jax.native import apart, one_function, read, write
 
 DIGIT = 11  # bits that a pass of the radix sort looks at
 BUCKETS = 2**DIGIT
@@ -59,31 +59,23 @@ def _counting_sort(keys: Int[Array, " M"], buckets: int) -> tuple[Int[Array, " M
 
 def _count_and_place(keys, buckets):
     def count(i, starts):
-        bucket = _read(keys, i) + 1
-        return _write(starts, bucket, _read(starts, bucket) + 1)
+        bucket = read(keys, i) + 1
+        return write(starts, bucket, read(starts, bucket) + 1)
 
     def accumulate(bucket, starts):
-        return _write(starts, bucket, _read(starts, bucket) + _read(starts, bucket - 1))
+        return write(starts, bucket, read(starts, bucket) + read(starts, bucket - 1))
 
     def place(i, state):
         following, order = state
-        bucket = _read(keys, i)
+        bucket = read(keys, i)
         # Read apart: merged into both writes, it would make XLA copy the array that it reads from.
-        position = apart(_read)(following, bucket)
-        return _write(following, bucket, position + 1), _write(order, position, i)
+        position = apart(read)(following, bucket)
+        return write(following, bucket, position + 1), write(order, position, i)
 
     loop = lambda low, high, body, state: jax.lax.fori_loop(jnp.int32(low), jnp.int32(high), body, state)
     starts = loop(0, keys.shape[0], count, jnp.zeros(buckets + 1, jnp.int32))
     starts = loop(1, buckets + 1, accumulate, starts)
     return loop(0, keys.shape[0], place, (starts[:-1], jnp.zeros_like(keys)))[1], starts
-
-
-def _read(array, i):
-    return jax.lax.dynamic_index_in_dim(array, i, keepdims=False)
-
-
-def _write(array, i, value):
-    return jax.lax.dynamic_update_slice(array, value[None], (i,))
 
 
 def _radix_argsort(values):
