@@ -51,17 +51,27 @@ def write(array: Shaped[Array, " N"], i: Int[Array, ""], value: Shaped[Array, ""
     return jax.lax.dynamic_update_slice(array, value[None], (i,))
 
 
+def read_row(table: Float[Array, "N D"], i: Int[Array, ""]) -> Float[Array, "1 D"]:
+    """`table[i : i + 1]` with `i` clamped to the table."""
+    return jax.lax.dynamic_slice(table, (i, jnp.int32(0)), (1, table.shape[1]))
+
+
+def write_row(table: Float[Array, "N D"], i: Int[Array, ""], row: Float[Array, "1 D"]) -> Float[Array, "N D"]:
+    """`table.at[i].set(row[0])` with `i` clamped to the table, in the form that loops do in place."""
+    return jax.lax.dynamic_update_slice(table, row, (i, jnp.int32(0)))
+
+
+def add_row(table: Float[Array, "N D"], i: Int[Array, ""], row: Float[Array, "1 D"]) -> Float[Array, "N D"]:
+    """`table.at[i].add(row[0])` in the form that loops do in place."""
+    return write_row(table, i, read_row(table, i) + row)
+
+
 def add_rows_in_turn(
     table: Float[Array, "N D"], ids: Int[Array, "*S"], rows: Float[Array, "*S D"]
 ) -> Float[Array, "N D"]:
     """`table.at[ids].add(rows)` as a loop, which `one_function` can hold."""
     ids, rows = ids.reshape(-1), rows.reshape(-1, table.shape[1])
-
-    def add(i, table):
-        place, one = (ids[i], jnp.int32(0)), (1, table.shape[1])
-        row = jax.lax.dynamic_slice(table, place, one) + jax.lax.dynamic_slice(rows, (i, jnp.int32(0)), one)
-        return jax.lax.dynamic_update_slice(table, row, place)
-
+    add = lambda i, table: add_row(table, read(ids, i), read_row(rows, i))
     return jax.lax.fori_loop(jnp.int32(0), jnp.int32(ids.shape[0]), add, table)
 
 

@@ -196,7 +196,7 @@ def test_gradients(moving):
     def f(params, viewmat, time):
         return moved_at(params, cameras=Camera(viewmat, cameras.K, time), moving=moving)
 
-    check_grads(f, (params, cameras.viewmat, cameras.time), 1, ["fwd", "rev"], eps=1e-6)
+    check_grads(f, (params, cameras.viewmat, cameras.time), 1, ["rev"], eps=1e-6)
 
 
 @pytest.mark.parametrize("moving", [False, True])
