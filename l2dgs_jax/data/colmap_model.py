@@ -3,7 +3,7 @@
 import struct
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Float32, Float64
@@ -251,7 +251,7 @@ def _lines(path: Path, keep_empty: bool = False) -> list[str]:
     return [line for line in lines if not line.startswith("#") and (line or keep_empty)]
 
 
-def _parsed(path: Path, line: str, words: Sequence[str], kinds: Sequence[type]) -> list[float]:
+def _parsed(path: Path, line: str, words: Sequence[str], kinds: Sequence[type]) -> list[Any]:
     """The words as numbers of these kinds, the last one for all that follow."""
     kinds = [*kinds[:-1], *[kinds[-1]] * (len(words) - len(kinds) + 1)]
     try:
