@@ -15,6 +15,7 @@ from l2dgs_jax import checkpoint, cli, engine, runs, visualize
 from l2dgs_jax.checkpoint import Checkpoint
 from l2dgs_jax.config import PRESETS, Config
 from l2dgs_jax.data import load
+from l2dgs_jax.data.images import write_image
 from l2dgs_jax.errors import UserError
 
 LOG_EVERY = 10  # steps between lines of the metrics file
@@ -43,7 +44,7 @@ def train(arguments: Sequence[str]) -> None:
     options = _parse(arguments)
     folder, config = options.output, options.config
     assert folder is not None
-    dataset = load(options.scene, config.downscale)
+    dataset = load(options.scene, config.downscale, config.format, config.held_out)
     config = engine.resolve(config, dataset.train)
     state, pair_capacity = engine.initial_state(dataset, config), None
     if options.resume:
@@ -51,6 +52,8 @@ def train(arguments: Sequence[str]) -> None:
     else:
         runs.write_settings(folder, options.scene, config)
 
+    for note in dataset.notes:
+        print(f"note: {note}")
     print(f"{dataset.name}: {len(dataset.train.names)} frames of {dataset.width}x{dataset.height}; run folder {folder}")
     start = int(state.step)
     try:
@@ -61,7 +64,7 @@ def train(arguments: Sequence[str]) -> None:
         ) from None
 
     run = runs.open_run(folder)
-    visualize.write_image(folder / runs.CONTACT_SHEET, visualize.contact_sheet(run))
+    write_image(folder / runs.CONTACT_SHEET, visualize.contact_sheet(run))
     visualize.video(run, folder / runs.VIDEO)
     print(f"wrote {folder / runs.CONTACT_SHEET} and {folder / runs.VIDEO}")
     print(f"next: python -m l2dgs_jax.evaluate {folder}   or   python -m l2dgs_jax.render {folder}")

@@ -36,6 +36,7 @@ ORDER = [
     "render",
     "evaluate",
     "train",
+    "convert",
 ]
 PACKAGE = Path(l2dgs_jax.__file__).parent
 MODULES = [path for path in PACKAGE.rglob("*.py") if path != PACKAGE / "__init__.py"]
