@@ -82,8 +82,7 @@ def read_ply(path: Path) -> Cloud:
     lines = [line.split() for line in head.decode("ascii", "replace").splitlines()]
     try:
         rows = _vertices(lines, body.partition(b"\n")[2])
-        with np.errstate(invalid="ignore"):  # signalling NaNs; found below
-            points = np.stack([rows[axis].astype(np.float64) for axis in "xyz"], -1)
+        points = np.stack([rows[axis].astype(np.float64) for axis in "xyz"], -1)
     except (ValueError, KeyError, IndexError, TypeError) as error:
         raise UserError(f"{path}: not a PLY file of points ({error}); expected vertices with x, y, z") from None
     if not found or not len(points) or not np.isfinite(points).all():

@@ -29,7 +29,6 @@ def recognizes(folder: Path) -> bool:
     return (folder / "camera").is_dir()
 
 
-@np.errstate(over="ignore", invalid="ignore")  # what overflows is complained of when the scene is assembled
 def read(folder: Path, downscale: int, held_out: str) -> Dataset:
     """Read a scene. World units are those of the scene file: X' = (X - center) * scale.
 
