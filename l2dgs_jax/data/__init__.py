@@ -4,6 +4,8 @@ import zipfile
 from pathlib import Path
 from types import ModuleType
 
+import numpy as np
+
 from l2dgs_jax.data import colmap, demo, llff, nerfies, splits, transforms
 from l2dgs_jax.data.dataset import Dataset
 from l2dgs_jax.errors import UserError
@@ -37,7 +39,8 @@ def load(scene: str | Path, downscale: int = 1, format: str = "auto", held_out: 
     elif format not in LAYOUTS:
         raise UserError(f"--format {format}: no such layout; expected auto, {', '.join(LAYOUTS)}")
     try:
-        return LAYOUTS[format].read(folder, downscale, held_out)
+        with np.errstate(all="ignore"):  # `assemble` complains of what has overflown
+            return LAYOUTS[format].read(folder, downscale, held_out)
     except OSError as error:
         raise UserError(f"{error.filename or folder}: {error.strerror}; expected files that can be read") from None
 
