@@ -5,6 +5,7 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import tyro
@@ -96,7 +97,7 @@ def write(folder: Path, names: Sequence[str], masks: Bool[np.ndarray, "F H W"]) 
             for name, mask in zip(names, masks, strict=True):
                 path = new / f"{name}.png"
                 path.parent.mkdir(parents=True, exist_ok=True)
-                write_image(path, np.where(mask, 255, 0).astype(np.uint8)[..., None])
+                write_image(path, 255 * mask.astype(np.uint8))
             folder.parent.mkdir(exist_ok=True)
             if folder.exists():
                 os.rename(folder, old)
@@ -135,8 +136,8 @@ def preview(dataset: Dataset, masks: Bool[np.ndarray, "F H W"]) -> UInt8[np.ndar
 def _all_frames(dataset: Dataset) -> tuple[Camera, np.ndarray]:
     """Cameras and images of both splits."""
     both = (dataset.train, dataset.test)
-    cameras = Camera(*(np.concatenate(parts) for parts in zip(*(split.cameras for split in both), strict=True)))
-    return cameras, np.concatenate([split.images for split in both])
+    parts: list[Any] = [np.concatenate(arrays) for arrays in zip(*(split.cameras for split in both), strict=True)]
+    return Camera(*parts), np.concatenate([split.images for split in both])
 
 
 if __name__ == "__main__":

@@ -2,8 +2,8 @@
 
 Every frame is matched with others, earlier and later by several gaps, that see the scene from about the same place. A
 still point has one depth that explains all of its matches; a moving one has none: not across the epipolar lines, nor
-along them, because the views are many and the sparse points bound the depth. How exact matches are is measured: pixel by
-pixel by whether flow there and back returns, and view by view by how well the still bulk of the scene fits.
+along them, because the views are many and the sparse points bound the depth. How exact matches are is measured: for
+each pixel by whether flow there and back returns, and for each view by how well the still bulk of the scene fits.
 """
 
 import functools
@@ -22,9 +22,9 @@ GAPS = ((1, 1), (2, 3), (4, 6), (7, 12))  # instants between matched frames, fro
 BLUR = 1.0  # standard deviation in pixels of what takes noise off before matching
 ACCURACY = 0.3  # pixels; matches are first taken, and never more than a third of it below, as accurate as this
 LOST = 3.0  # pixels from where flow returns to that void a match
-OUTLIER = 5.0  # standard deviations at which a match contradicts in full
-STILL_MATCHES = 0.5  # how many perfect matches every pixel is credited with: no matches, no motion
-CONTRADICTION = 0.4  # part of the matches that contradict where something moves
+OUTLIER = 7.0  # standard deviations at which a match contradicts in full
+STILL_MATCHES = 1.0  # perfect matches that every pixel is credited with: without any, nothing moves
+CONTRADICTION = 0.28  # part of the matches that contradict where something moves
 EDGE_RADIUS, EDGE_CONTRAST = (
     0.02,
     0.1,
@@ -93,7 +93,8 @@ def brightened(images: Float[np.ndarray, "F H W 3"]) -> UInt8[np.ndarray, "F H W
 def partners(cameras: Camera, points: Float[np.ndarray, "P 3"], size: tuple[int, int], frame: int) -> list[int]:
     """Frames to match a frame with: for every gap in `GAPS`, earlier and later, the one whose view differs least.
 
-    A view of the same instant comes with them if there is one: it shows the depth, whatever moves.
+    Views differ by how far points shift between them, in the median. A view of the same instant comes with them if
+    there is one: it shows the depth, whatever moves.
 
     Args:
         cameras: of all frames.
@@ -104,17 +105,18 @@ def partners(cameras: Camera, points: Float[np.ndarray, "P 3"], size: tuple[int,
     seen, depth = _visible(cameras, points, size, frame)
     instants = np.unique(cameras.time, return_inverse=True)[1].reshape(-1)
     offsets = instants - instants[frame]
-    offsets[frame] = len(offsets)  # beyond every gap
     if not len(depth):
         return []
 
-    def shift(other: int) -> float:
-        geometry = epipolar_geometry(cameras, frame, other)
-        return float(np.median(np.linalg.norm(project(geometry, seen, 1 / depth) - seen, axis=-1)))
+    def difference(other: int) -> tuple[float, int]:
+        ends = project(epipolar_geometry(cameras, frame, other), seen, 1 / depth)
+        shift = float(np.median(np.linalg.norm(ends - seen, axis=-1)))
+        return round(shift, 1), abs(int(offsets[other]))  # of equal views the one closer in time
 
     bands = [(0, 0), *GAPS, *((-last, -first) for first, last in GAPS)]
-    candidates = [np.flatnonzero((first <= offsets) & (offsets <= last)).tolist() for first, last in bands]
-    return [min(band, key=shift) for band in candidates if band]
+    candidates = [np.flatnonzero((first <= offsets) & (offsets <= last)) for first, last in bands]
+    others = [band[band != frame].tolist() for band in candidates]
+    return [min(band, key=difference) for band in others if band]
 
 
 def inverse_depths(
