@@ -24,7 +24,7 @@ ACCURACY = 0.3  # pixels; matches are first taken, and never more than a third o
 LOST = 3.0  # pixels from where flow returns to that void a match
 OUTLIER = 7.0  # standard deviations at which a match contradicts in full
 STILL_MATCHES = 1.0  # perfect matches that every pixel is credited with: without any, nothing moves
-CONTRADICTION = 0.28  # part of the matches that contradict where something moves
+CONTRADICTION = 0.3  # part of the matches that contradict where something moves
 EDGE_RADIUS, EDGE_CONTRAST = (
     0.02,
     0.1,
