@@ -20,15 +20,13 @@ from l2dgs_jax.types import Camera
 
 GAPS = ((1, 1), (2, 3), (4, 6), (7, 12))  # instants between matched frames, from and to
 BLUR = 1.0  # standard deviation in pixels of what takes noise off before matching
-ACCURACY = 0.3  # pixels; matches are first taken, and never more than a third of it below, as accurate as this
+ACCURACY = 0.2  # pixels: how exact matches are taken to be at first, and three times the least they can be
 LOST = 3.0  # pixels from where flow returns to that void a match
-OUTLIER = 7.0  # standard deviations at which a match contradicts in full
+OUTLIER = 10.0  # standard deviations at which a match contradicts in full
 STILL_MATCHES = 1.0  # perfect matches that every pixel is credited with: without any, nothing moves
 CONTRADICTION = 0.3  # part of the matches that contradict where something moves
-EDGE_RADIUS, EDGE_CONTRAST = (
-    0.02,
-    0.1,
-)  # of the guided filter: part of the picture's diagonal, and grey levels in [0, 1]
+EDGE_RADIUS = 0.02  # of the guided filter, as part of the picture's diagonal
+EDGE_CONTRAST = 0.1  # that makes an edge, as part of the grey scale
 SMALLEST = 1e-3  # part of the picture that a moving or still region covers at least
 
 
@@ -139,8 +137,7 @@ def match(there: Float32[np.ndarray, "H W 2"], back: Float32[np.ndarray, "H W 2"
     height, width = there.shape[:2]
     columns, rows = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
     ends = there + np.stack([columns, rows], axis=-1)
-    outside = (2 * LOST, 2 * LOST)
-    returned = cv2.remap(back, ends[..., 0], ends[..., 1], cv2.INTER_LINEAR, borderValue=(*outside, 0, 0))
+    returned = cv2.remap(back, ends[..., 0], ends[..., 1], cv2.INTER_LINEAR)
     left = (ends < 0).any(-1) | (ends > (width - 1, height - 1)).any(-1)
     errors = np.where(left, np.float32(2 * LOST), np.linalg.norm(there + returned, axis=-1))
     return Matches(ends + np.float32(0.5), errors.astype(np.float32))  # pixel centres lie at +0.5
@@ -151,9 +148,9 @@ def contradiction(
 ) -> Float32[np.ndarray, "H W"]:
     """Which part of a pixel's matches contradicts that it shows a still point, at whatever depth suits it best.
 
-    A residual counts in units of how exact matches with that view are, squared, up to `OUTLIER` at which it counts in
-    full: the median residual where flow returns, most of the scene being still. A match counts less the further from
-    its start flow returns.
+    Residuals count by their squares, and in full from `OUTLIER` standard deviations of matches with that view, which
+    are known from the median residual, most of the scene being still. A match counts less the further from its start
+    flow returns.
 
     Args:
         geometry: from the frame to each of the K matched ones.
@@ -170,19 +167,15 @@ def contradiction(
     returned = matches.errors < 1
     sigmas = np.full(len(residuals[0]), ACCURACY, np.float32)
     for _ in range(2):
-        squares = sigmas[:, None, None] ** 2
-        weights = np.where(matches.errors < LOST, squares / (squares + matches.errors**2), 0)
-        costs = np.minimum(residuals**2 / (squares * OUTLIER**2), 1)
+        variances = sigmas[:, None, None] ** 2
+        # Flow errs twice on its way there and back.
+        weights = np.where(matches.errors < LOST, variances / (variances + matches.errors**2 / 2), 0)
+        costs = np.minimum(residuals**2 / (variances * OUTLIER**2), 1)
         scores = (weights * costs).sum(1) / (weights.sum(0) + STILL_MATCHES)
-        best = scores.argmin(0)
-        fitted = np.take_along_axis(residuals, best[None, None], axis=0)[0]
-        sigmas = np.array(
-            [
-                max(ACCURACY / 3, 1.2 * np.median(residual[there])) if there.any() else ACCURACY
-                for residual, there in zip(fitted, returned, strict=True)
-            ],
-            np.float32,
-        )
+        fitted = np.take_along_axis(residuals, scores.argmin(0)[None, None], axis=0)[0]
+        medians = [np.median(r[b]) if b.any() else 0 for r, b in zip(fitted, returned, strict=True)]
+        # Of a vector with normal components, one standard deviation each, the median length is 1.177.
+        sigmas = np.maximum(np.array(medians, np.float32) / 1.177, ACCURACY / 3)
     return scores.min(0).astype(np.float32)
 
 
