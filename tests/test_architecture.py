@@ -15,6 +15,8 @@ ORDER = [
     "config",
     "tone",
     "data",
+    "epipolar",
+    "motion",
     "hexplane",
     "networks",
     "spherical_harmonics",
@@ -37,6 +39,7 @@ ORDER = [
     "evaluate",
     "train",
     "convert",
+    "masks",
 ]
 PACKAGE = Path(l2dgs_jax.__file__).parent
 MODULES = [path for path in PACKAGE.rglob("*.py") if path != PACKAGE / "__init__.py"]

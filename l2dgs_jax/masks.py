@@ -1,0 +1,145 @@
+"""`python -m l2dgs_jax.masks SCENE`: masks of what moves, for scores of the dynamic and the static region."""
+
+import os
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tyro
+from jaxtyping import Bool, UInt8
+from tqdm import tqdm
+
+from l2dgs_jax import cli
+from l2dgs_jax.data import load
+from l2dgs_jax.data.dataset import Dataset
+from l2dgs_jax.data.images import to_bytes, write_image
+from l2dgs_jax.errors import UserError
+from l2dgs_jax.motion import brightened, moving_masks
+from l2dgs_jax.types import Camera
+from l2dgs_jax.visualize import sheet
+
+PREVIEW_ROWS = 12
+PREVIEW_LEVEL = 0.45  # mean that the preview's pictures are brightened to
+
+
+@dataclass(frozen=True)
+class Masks:
+    """Find what moves and write SCENE/mask/<k>x/NAME.png for every frame: 255 where something moves, 0 elsewhere.
+
+    Attributes:
+        scene: folder of the scene.
+        downscale: factor k by which the images that are looked at, and the masks, are smaller than full size. Masks of
+            size 1 serve every other as well.
+        overwrite: replace the masks that the scene has.
+        preview: picture to write, showing frames with what moves tinted.
+    """
+
+    scene: tyro.conf.Positional[Path]
+    downscale: int = 1
+    overwrite: bool = False
+    preview: Path | None = None
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Write the masks of a scene as the command line says."""
+    options = cli.parse(Masks, arguments, "masks")
+    dataset = load(options.scene, options.downscale)
+    folder = options.scene / "mask" / f"{options.downscale}x"
+    if not options.overwrite and not (dataset.train.masks is None and dataset.test.masks is None):
+        raise UserError(f"{folder.parent}: holds masks of this scene; expected none, or --overwrite to replace them")
+    if folder.parent.exists() and not folder.parent.is_dir():
+        raise UserError(f"{folder.parent}: is a file; expected a folder, or nothing, to write masks to")
+    if not os.access(options.scene, os.W_OK):
+        raise UserError(f"{options.scene}: cannot be written; expected a writable folder to put masks in")
+    if options.preview and not options.preview.parent.is_dir():
+        raise UserError(f"--preview {options.preview}: cannot be written; expected a file in an existing folder")
+
+    masks = compute(dataset)
+    names = [*dataset.train.names, *dataset.test.names]
+    write(folder, names, masks)
+    print(f"wrote {len(names)} masks to {folder}; {100 * masks.mean():.1f} % of the pixels move")
+    if options.preview:
+        write_image(options.preview, preview(dataset, masks))
+
+
+def compute(dataset: Dataset) -> Bool[np.ndarray, "F H W"]:
+    """Masks of what moves, of the training frames and then the held-out ones, showing progress.
+
+    Both are looked at together: held-out frames are few, and training frames of other instants show what moved.
+
+    Raises:
+        UserError: all frames are of one instant.
+    """
+    cameras, images = _all_frames(dataset)
+    masks = np.zeros(images.shape[:3], bool)
+    try:
+        found = moving_masks(cameras, images, dataset.points)
+        for frame, mask in tqdm(found, total=len(masks), desc="masks", unit="frame", dynamic_ncols=True):
+            masks[frame] = mask
+    except UserError as error:
+        raise UserError(f"{dataset.name}: {error}") from None
+    return masks
+
+
+def write(folder: Path, names: Sequence[str], masks: Bool[np.ndarray, "F H W"]) -> None:
+    """Write `folder/NAME.png`, all of them or none; what was in `folder` is gone afterwards.
+
+    Raises:
+        UserError: the folder cannot be written.
+    """
+    scene = folder.parent.parent
+    try:
+        # Beside mask/, because a scene with an empty mask/ cannot be read.
+        with tempfile.TemporaryDirectory(dir=scene, prefix=".mask-", ignore_cleanup_errors=True) as top:
+            new, old = Path(top) / "new", Path(top) / "old"
+            for name, mask in zip(names, masks, strict=True):
+                path = new / f"{name}.png"
+                path.parent.mkdir(parents=True, exist_ok=True)
+                write_image(path, 255 * mask.astype(np.uint8))
+            folder.parent.mkdir(exist_ok=True)
+            if folder.exists():
+                os.rename(folder, old)
+            os.rename(new, folder)
+    except OSError as error:
+        raise UserError(f"{folder}: cannot be written ({error.strerror}); expected a writable folder") from None
+
+
+def preview(dataset: Dataset, masks: Bool[np.ndarray, "F H W"]) -> UInt8[np.ndarray, "h w 3"]:
+    """Frames spread over time, training and held out, as they are, brightened for matching, and with masks in red.
+
+    Args:
+        dataset: the scene.
+        masks: of its training and then its held-out frames.
+    """
+    cameras, images = _all_frames(dataset)
+    names = [*dataset.train.names, *dataset.test.names]
+    held_out = np.arange(len(names)) >= len(dataset.train.names)
+    chosen: list[int] = []
+    for part in (~held_out, held_out):
+        frames = np.flatnonzero(part)[np.argsort(cameras.time[part], kind="stable")]
+        chosen += frames[np.unique(np.linspace(0, len(frames) - 1, PREVIEW_ROWS // 2).round().astype(int))].tolist()
+
+    exponent = np.log(PREVIEW_LEVEL) / np.log(np.clip(images[chosen].astype(np.float32).mean(), 1e-3, 0.99))
+    rows = []
+    for frame, grey in zip(chosen, brightened(images[chosen]), strict=True):
+        bright = np.clip(images[frame].astype(np.float32), 0, 1) ** min(exponent, 1)
+        tinted = np.where(masks[frame][..., None], 0.5 * bright + (0.5, 0, 0), bright)
+        pictures = [to_bytes(images[frame]), np.repeat(grey[..., None], 3, axis=-1), to_bytes(tinted)]
+        kind = "held out" if held_out[frame] else "trained on"
+        area = 100 * masks[frame].mean()
+        rows.append((f"{names[frame]}, time {cameras.time[frame]:.2f}, {kind}, {area:.1f} % moves", pictures))
+    return sheet(("input", "as matched", "mask"), rows)
+
+
+def _all_frames(dataset: Dataset) -> tuple[Camera, np.ndarray]:
+    """Cameras and images of both splits."""
+    both = (dataset.train, dataset.test)
+    parts: list[Any] = [np.concatenate(arrays) for arrays in zip(*(split.cameras for split in both), strict=True)]
+    return Camera(*parts), np.concatenate([split.images for split in both])
+
+
+if __name__ == "__main__":
+    cli.main(main)

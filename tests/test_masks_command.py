@@ -1,0 +1,138 @@
+"""The command that writes masks of what moves into a scene."""
+
+import os
+
+import cv2
+import numpy as np
+import pytest
+from planar_video import FOCAL, HEIGHT, WIDTH, video
+from scenes import write_image, write_json
+
+from l2dgs_jax import cli, data, masks
+from l2dgs_jax.data.dataset import Dataset
+from l2dgs_jax.errors import UserError
+
+FRAMES, HELD_OUT = 8, ("000003", "000006")
+
+
+@pytest.fixture(autouse=True)
+def _no_compilation_cache(monkeypatch):
+    monkeypatch.setenv("L2DGS_JAX_CACHE", "off")
+
+
+@pytest.fixture
+def scene(tmp_path):
+    film = video(motion=(0.0, 0.09), frames=FRAMES)
+    folder = tmp_path / "a scene"
+    names = [f"{i:06d}" for i in range(FRAMES)]
+    for i, name in enumerate(names):
+        camera = {
+            "orientation": np.eye(3).tolist(),
+            "position": (-film.cameras.viewmat[i, :3, 3]).tolist(),
+            "focal_length": FOCAL,
+            "principal_point": [WIDTH / 2, HEIGHT / 2],
+            "image_size": [WIDTH, HEIGHT],
+        }
+        write_json(folder / "camera" / f"{name}.json", camera)
+        write_image(folder / "rgb" / "1x" / f"{name}.png", film.images[i].astype(float))
+    train = [name for name in names if name not in HELD_OUT]
+    write_json(folder / "dataset.json", {"ids": names, "train_ids": train, "val_ids": list(HELD_OUT)})
+    np.save(folder / "points.npy", film.points.astype(np.float32))
+    return folder
+
+
+def files(folder):
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def failure(capsys, arguments):
+    with pytest.raises(SystemExit) as leave:
+        cli.main(masks.main, [str(argument) for argument in arguments])
+    assert leave.value.code == 2
+    error = capsys.readouterr().err
+    assert len(error.strip().splitlines()[-1:]) == 1
+    return error
+
+
+def test_masks_of_both_splits_are_written_and_read_back(scene, tmp_path, capsys):
+    before = files(scene)
+    cli.main(masks.main, [str(scene), "--preview", str(tmp_path / "preview.png")])
+    folder = scene / "mask" / "1x"
+    assert f"wrote {FRAMES} masks to {folder}" in capsys.readouterr().out
+    assert files(scene).keys() - before.keys() == {f"mask/1x/{i:06d}.png" for i in range(FRAMES)}
+    written = cv2.imread(str(folder / "000000.png"), cv2.IMREAD_UNCHANGED)
+    assert written.shape == (HEIGHT, WIDTH)
+    assert set(np.unique(written)) == {0, 255}
+
+    dataset, truth = data.load(scene), video(motion=(0.0, 0.09), frames=FRAMES).truth
+    held_out = np.isin([f"{i:06d}" for i in range(FRAMES)], HELD_OUT)
+    for split, expected in ((dataset.train, truth[~held_out]), (dataset.test, truth[held_out])):
+        assert (split.masks & expected).sum() / (split.masks | expected).sum() > 0.65
+    assert data.load(scene, 2).test.masks.any()  # masks of full size serve smaller ones
+
+    # Only the preview's last column is tinted, where the board is.
+    sheet = cv2.imread(str(tmp_path / "preview.png")).astype(int)
+    redder = [(column[..., 2] > column[..., 0] + 80).mean() for column in np.array_split(sheet, 3, axis=1)]
+    assert redder[2] > redder[0] + 0.02
+
+
+def test_masks_that_exist_stay_unless_told_otherwise(scene, capsys):
+    for name in files(scene / "rgb" / "1x"):
+        write_image(scene / "mask" / "1x" / name, np.zeros((HEIGHT, WIDTH)))
+    before = files(scene)
+    message = "mask: holds masks of this scene; expected none, or --overwrite to replace them"
+    for downscale in (1, 2):  # half-size masks would hide the given ones at half size
+        assert message in failure(capsys, [scene, "--downscale", downscale])
+        assert files(scene) == before
+    cli.main(masks.main, [str(scene), "--overwrite"])
+    assert files(scene).keys() == before.keys()
+    assert data.load(scene).train.masks.any()
+
+
+def test_names_may_have_folders_spaces_and_other_scripts(tmp_path):
+    names = ["left/a b", "right/日本"]
+    (tmp_path / "mask" / "2x").mkdir(parents=True)
+    (tmp_path / "mask" / "2x" / "older.png").write_text("")
+    masks.write(tmp_path / "mask" / "2x", names, np.stack([np.eye(3, dtype=bool), np.zeros((3, 3), bool)]))
+    assert files(tmp_path).keys() == {f"mask/2x/{name}.png" for name in names}
+    assert data.images.read_image(tmp_path / "mask" / "2x" / "left" / "a b.png")[..., 0].sum() == 3
+
+
+def test_a_failure_midway_leaves_the_scene_as_it_was(scene, monkeypatch):
+    write_image(scene / "mask" / "1x" / "000000.png", np.zeros((HEIGHT, WIDTH)))
+    before = files(scene)
+    written = []
+
+    def fill_the_disk(path, image):
+        written.append(path)
+        if len(written) == 3:
+            raise OSError(28, "No space left on device")
+        write_image(path, image)
+
+    monkeypatch.setattr(masks, "write_image", fill_the_disk)
+    with pytest.raises(UserError, match=r"mask/1x: cannot be written \(No space left on device\)"):
+        masks.write(scene / "mask" / "1x", list("abcd"), np.zeros((4, 3, 3), bool))
+    assert files(scene) == before
+    assert sorted(path.name for path in scene.iterdir()) == ["camera", "dataset.json", "mask", "points.npy", "rgb"]
+
+
+def test_bad_input_is_one_sentence_before_any_work(scene, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(masks, "compute", lambda dataset: pytest.fail("too late"))
+    assert "no such folder" in failure(capsys, [tmp_path / "missing"])
+    assert "expected a file in an existing folder" in failure(capsys, [scene, "--preview", tmp_path / "no" / "x.png"])
+    monkeypatch.setattr(os, "access", lambda path, mode: False)
+    assert "cannot be written; expected a writable folder" in failure(capsys, [scene])
+    monkeypatch.undo()
+    (scene / "mask").write_text("")
+    assert "mask: is a file; expected a folder" in failure(capsys, [scene])
+    assert (scene / "mask").read_text() == ""
+
+
+def test_frames_of_one_instant_are_refused_by_name(scene):
+    dataset = data.load(scene)
+    still = lambda split: split.__class__(
+        split.names, split.cameras._replace(time=0 * split.cameras.time), split.images
+    )
+    parts = (dataset.width, dataset.height, still(dataset.train), still(dataset.test), dataset.points)
+    with pytest.raises(UserError, match="quiet: all frames are of one instant"):
+        masks.compute(Dataset("quiet", *parts))
