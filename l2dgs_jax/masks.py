@@ -14,8 +14,9 @@ from tqdm import tqdm
 
 from l2dgs_jax import cli
 from l2dgs_jax.data import load
-from l2dgs_jax.data.dataset import Dataset
+from l2dgs_jax.data.dataset import Dataset, Original
 from l2dgs_jax.data.images import to_bytes, write_image
+from l2dgs_jax.data.lens import distorted
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.motion import brightened, moving_masks
 from l2dgs_jax.types import Camera
@@ -27,12 +28,13 @@ PREVIEW_LEVEL = 0.45  # mean that the preview's pictures are brightened to
 
 @dataclass(frozen=True)
 class Masks:
-    """Find what moves and write SCENE/mask/<k>x/NAME.png for every frame: 255 where something moves, 0 elsewhere.
+    """Find what moves and write SCENE/mask/1x/NAME.png for every frame: 255 where something moves, 0 elsewhere.
+
+    Masks fit the pictures as they lie in the scene, at full size and with the distortion of their lens.
 
     Attributes:
         scene: folder of the scene.
-        downscale: factor k by which the images that are looked at, and the masks, are smaller than full size. Masks of
-            size 1 serve every other as well.
+        downscale: whole factor by which the images that are looked at are smaller than full size.
         overwrite: replace the masks that the scene has.
         preview: picture to write, showing frames with what moves tinted.
     """
@@ -47,7 +49,7 @@ def main(arguments: Sequence[str]) -> None:
     """Write the masks of a scene as the command line says."""
     options = cli.parse(Masks, arguments, "masks")
     dataset = load(options.scene, options.downscale)
-    folder = options.scene / "mask" / f"{options.downscale}x"
+    folder = options.scene / "mask" / "1x"
     if not options.overwrite and not (dataset.train.masks is None and dataset.test.masks is None):
         raise UserError(f"{folder.parent}: holds masks of this scene; expected none, or --overwrite to replace them")
     if folder.parent.exists() and not folder.parent.is_dir():
@@ -59,7 +61,12 @@ def main(arguments: Sequence[str]) -> None:
 
     masks = compute(dataset)
     names = [*dataset.train.names, *dataset.test.names]
-    write(folder, names, masks)
+    originals = [*dataset.train.originals, *dataset.test.originals]
+    write(
+        folder,
+        names,
+        [as_taken(mask, options.downscale, original) for mask, original in zip(masks, originals, strict=True)],
+    )
     print(f"wrote {len(names)} masks to {folder}; {100 * masks.mean():.1f} % of the pixels move")
     if options.preview:
         write_image(options.preview, preview(dataset, masks))
@@ -84,7 +91,15 @@ def compute(dataset: Dataset) -> Bool[np.ndarray, "F H W"]:
     return masks
 
 
-def write(folder: Path, names: Sequence[str], masks: Bool[np.ndarray, "F H W"]) -> None:
+def as_taken(mask: Bool[np.ndarray, "h w"], downscale: int, original: Original) -> Bool[np.ndarray, "H W"]:
+    """A mask of a frame as it is loaded, as a mask of the picture that the frame was loaded from."""
+    width, height = original.size
+    full = mask.astype(np.uint8).repeat(downscale, axis=0).repeat(downscale, axis=1)
+    full = np.pad(full, ((0, height - full.shape[0]), (0, width - full.shape[1])), mode="edge")
+    return distorted(full, original.K, original.lens) > 0
+
+
+def write(folder: Path, names: Sequence[str], masks: Sequence[Bool[np.ndarray, "H W"]]) -> None:
     """Write `folder/NAME.png`, all of them or none; what was in `folder` is gone afterwards.
 
     Raises:

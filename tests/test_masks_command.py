@@ -9,7 +9,9 @@ from planar_video import FOCAL, HEIGHT, WIDTH, video
 from scenes import write_image, write_json
 
 from l2dgs_jax import cli, data, masks
-from l2dgs_jax.data.dataset import Dataset
+from l2dgs_jax.data.dataset import Dataset, Original
+from l2dgs_jax.data.images import area_average
+from l2dgs_jax.data.lens import Lens, undistort
 from l2dgs_jax.errors import UserError
 
 FRAMES, HELD_OUT = 8, ("000003", "000006")
@@ -76,6 +78,19 @@ def test_masks_of_both_splits_are_written_and_read_back(scene, tmp_path, capsys)
     assert redder[2] > redder[0] + 0.02
 
 
+@pytest.mark.parametrize("lens", [Lens(), Lens((-0.3, 0.1), tangential=(0.01, -0.02)), Lens((0.05,), fisheye=True)])
+def test_masks_are_bent_as_the_lens_bends_the_pictures(lens):
+    width, height, downscale = 161, 122, 2
+    K = np.array([[100.0, 0, 83], [0, 105, 60], [0, 0, 1]])
+    rows, columns = np.mgrid[: height // downscale, : width // downscale]
+    mask = np.hypot(rows - 15, columns - 60) < 12
+    full = masks.as_taken(mask, downscale, Original((width, height), K, lens))
+    assert full.shape == (height, width)
+    straight = area_average(undistort(full[..., None].astype(np.float32), K, lens), downscale)
+    read_back = straight[: height // downscale, : width // downscale, 0] > 0.5
+    assert (read_back & mask).sum() / (read_back | mask).sum() > 0.95
+
+
 def test_masks_that_exist_stay_unless_told_otherwise(scene, capsys):
     for name in files(scene / "rgb" / "1x"):
         write_image(scene / "mask" / "1x" / name, np.zeros((HEIGHT, WIDTH)))
@@ -93,7 +108,7 @@ def test_names_may_have_folders_spaces_and_other_scripts(tmp_path):
     names = ["left/a b", "right/日本"]
     (tmp_path / "mask" / "2x").mkdir(parents=True)
     (tmp_path / "mask" / "2x" / "older.png").write_text("")
-    masks.write(tmp_path / "mask" / "2x", names, np.stack([np.eye(3, dtype=bool), np.zeros((3, 3), bool)]))
+    masks.write(tmp_path / "mask" / "2x", names, [np.eye(3, dtype=bool), np.zeros((3, 3), bool)])
     assert files(tmp_path).keys() == {f"mask/2x/{name}.png" for name in names}
     assert data.images.read_image(tmp_path / "mask" / "2x" / "left" / "a b.png")[..., 0].sum() == 3
 
@@ -111,7 +126,7 @@ def test_a_failure_midway_leaves_the_scene_as_it_was(scene, monkeypatch):
 
     monkeypatch.setattr(masks, "write_image", fill_the_disk)
     with pytest.raises(UserError, match=r"mask/1x: cannot be written \(No space left on device\)"):
-        masks.write(scene / "mask" / "1x", list("abcd"), np.zeros((4, 3, 3), bool))
+        masks.write(scene / "mask" / "1x", list("abcd"), [np.zeros((3, 3), bool)] * 4)
     assert files(scene) == before
     assert sorted(path.name for path in scene.iterdir()) == ["camera", "dataset.json", "mask", "points.npy", "rgb"]
 

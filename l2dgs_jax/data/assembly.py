@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float16, Float32
 
 from l2dgs_jax.data import images
-from l2dgs_jax.data.dataset import Dataset, Split
+from l2dgs_jax.data.dataset import Dataset, Original, Split
 from l2dgs_jax.data.lens import Lens, scale_intrinsics, undistort, without_skew
 from l2dgs_jax.data.pictures import Picture, stored_if_any
 from l2dgs_jax.errors import UserError
@@ -167,6 +167,7 @@ def _read_split(folder: Path, part: str, frames: Sequence[Frame], width: int, he
         masks=majority(read_all(folder / "mask")),
         valid=None if valid.all() else valid,
         covisible=majority(read_all(folder / "covisible", f"{part}/")),
+        originals=tuple(Original(frame.size, frame.K, frame.lens) for frame in frames),
     )
 
 

@@ -1,11 +1,27 @@
 """The one type that every reader returns."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
 
+from l2dgs_jax.data.lens import Lens
 from l2dgs_jax.types import Camera
+
+
+class Original(NamedTuple):
+    """The picture that a frame was read from.
+
+    Attributes:
+        size: width and height in pixels.
+        K: intrinsics, skew included.
+        lens: its distortion.
+    """
+
+    size: tuple[int, int]
+    K: Float[np.ndarray, "3 3"]
+    lens: Lens
 
 
 @dataclass(frozen=True)
@@ -20,6 +36,7 @@ class Split:
         masks: True where something moves, if the scene has them.
         valid: False where a picture shows nothing to learn from or to be scored on; None where all pixels do.
         covisible: True where enough training views see the same place, if the scene says so (arXiv 2210.13445).
+        originals: what lies on disk at full size, for those who write pictures that belong to it.
     """
 
     names: tuple[str, ...]
@@ -29,6 +46,7 @@ class Split:
     masks: Bool[np.ndarray, "F H W"] | None = None
     valid: Bool[np.ndarray, "F H W"] | None = None
     covisible: Bool[np.ndarray, "F H W"] | None = None
+    originals: tuple[Original, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float, Float32, Shaped
 
 
 class Lens(NamedTuple):
@@ -69,6 +69,20 @@ def undistort(
     return np.clip(warped.reshape(image.shape), 0, 1)  # cubic interpolation overshoots
 
 
+def distorted(image: Shaped[np.ndarray, "H W"], K: Float[np.ndarray, "3 3"], lens: Lens) -> Shaped[np.ndarray, "H W"]:
+    """What the lens would have imaged of a straight picture: `undistort` the other way round, nearest pixels.
+
+    Args:
+        image: of the pinhole camera `without_skew(K)`.
+        K: intrinsics, skew included.
+        lens: its distortion.
+    """
+    if lens.is_pinhole and K[0, 1] == 0:
+        return image
+    columns, rows = _origins(image.shape[1], image.shape[0], tuple(K[:2].ravel().tolist()), lens)
+    return cv2.remap(image, columns, rows, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
+
+
 def scale_intrinsics(K: Float[np.ndarray, "3 3"], factor: int) -> Float[np.ndarray, "3 3"]:
     """Intrinsics of a picture shrunk by `factor`; exact because pixel centres lie at +0.5."""
     return K / np.array([[factor], [factor], [1]])
@@ -100,6 +114,27 @@ def _places(
         columns, rows = fx * lens_x + skew * lens_y + cx - 0.5, fy * lens_y + cy - 0.5
     return _for_cubic(columns, width), _for_cubic(rows, height)
 
+
+@functools.lru_cache(maxsize=4)
+def _origins(
+    width: int, height: int, K: tuple[float, ...], lens: Lens
+) -> tuple[Float32[np.ndarray, "H W"], Float32[np.ndarray, "H W"]]:
+    """Column and row of the straight picture, centres counted from 0, that each pixel of the distorted one shows."""
+    fx, skew, cx, _, fy, cy = K
+    y = np.broadcast_to((np.arange(height) + 0.5 - cy)[:, None] / fy, (height, width))
+    x = ((np.arange(width) + 0.5 - cx)[None, :] - skew * y) / fx
+    straight_x, straight_y = x, y
+    with np.errstate(all="ignore"):
+        for _ in range(_SOLVER_STEPS):
+            lens_x, lens_y = distort(lens, straight_x, straight_y)
+            straight_x, straight_y = straight_x + x - lens_x, straight_y + y - lens_y
+        places = fx * straight_x + cx - 0.5, fy * straight_y + cy - 0.5
+    columns, rows = (np.nan_to_num(place, nan=-8, posinf=-8, neginf=-8).astype(np.float32) for place in places)
+    return columns, rows
+
+
+# Each step leaves 1 - s of an error, s being the slope of the distortion: a quarter 60 degrees off a fisheye's axis.
+_SOLVER_STEPS = 40
 
 # cv2's cubic kernel (a = -0.75) shows a ramp, at the offset o from a pixel, as 1.5 o - 1.5 o^2 + o^3, up to 0.05 pixels
 # off. This is the inverse, for offsets in steps of 1 / 4096.
