@@ -1,7 +1,7 @@
 """Pictures and videos of a run: contact sheet, a path through space and time, and the files they go to."""
 
 import contextlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -53,6 +53,7 @@ def contact_sheet(run: Run, rows: int = 4) -> UInt8[np.ndarray, "H W 3"]:
     headings = [f"{name} {ranges[name][0]:.4g}-{ranges[name][1]:.4g}" if name in ranges else name for name in columns]
 
     lines = []
+    kind = "held out" if held_out else "trained on"
     for row, i in enumerate(chosen):
         images = outputs[row].images
         pictures = {
@@ -64,10 +65,20 @@ def contact_sheet(run: Run, rows: int = 4) -> UInt8[np.ndarray, "H W 3"]:
         } | {name: viridis(values[row], *ranges[name]) for name, values in coloured.items()}
         if split.welllit is not None:
             pictures["truth"] = to_bytes(split.welllit[i])
-        cells = np.hstack([np.pad(_cell(pictures[name]), ((0, GAP), (0, GAP), (0, 0))) for name in columns])
-        kind = "held out" if held_out else "trained on"
-        lines += [_text(f"{split.names[i]}, time {split.cameras.time[i]:.2f}, {kind}", cells.shape[1]), cells]
-    header = np.hstack([_text(heading, lines[1].shape[1] // len(columns)) for heading in headings])
+        caption = f"{split.names[i]}, time {split.cameras.time[i]:.2f}, {kind}"
+        lines.append((caption, [pictures[name] for name in columns]))
+    return sheet(headings, lines)
+
+
+def sheet(
+    headings: Sequence[str], rows: Sequence[tuple[str, Sequence[UInt8[np.ndarray, "h w 3"]]]]
+) -> UInt8[np.ndarray, "H W 3"]:
+    """Pictures of one size in rows under headings, each row below its caption."""
+    lines = []
+    for caption, pictures in rows:
+        cells = np.hstack([np.pad(_cell(picture), ((0, GAP), (0, GAP), (0, 0))) for picture in pictures])
+        lines += [_text(caption, cells.shape[1]), cells]
+    header = np.hstack([_text(heading, lines[1].shape[1] // len(headings)) for heading in headings])
     return np.vstack([header, *lines])
 
 

@@ -27,15 +27,20 @@ ORDER = [
     "metrics",
     "losses",
     "optim",
+    "zerodce",
+    "lowlight",
     "density",
     "engine",
     "checkpoint",
+    "torch_pickle",
+    "darkeners",
     "runs",
     "cli",
     "visualize",
     "render",
     "evaluate",
     "train",
+    "simulate",
 ]
 PACKAGE = Path(l2dgs_jax.__file__).parent
 MODULES = [path for path in PACKAGE.rglob("*.py") if path != PACKAGE / "__init__.py"]
