@@ -11,8 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from l2dgs_jax.data import demo
-from l2dgs_jax.data.images import area_average, read_image
-from l2dgs_jax.visualize import to_bytes, write_image
+from l2dgs_jax.data.images import area_average, read_image, to_bytes, write_image
 
 FACTOR = 2
 README = """# The demo clip

@@ -11,7 +11,8 @@ import jax
 import numpy as np
 
 from l2dgs_jax import open_run
-from l2dgs_jax.visualize import to_bytes, view, write_image
+from l2dgs_jax.data.images import to_bytes, write_image
+from l2dgs_jax.visualize import view
 
 GAP = 6  # pixels
 

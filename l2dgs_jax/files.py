@@ -1,7 +1,8 @@
-"""Files that are written whole or not at all."""
+"""Files and folders that are written whole or not at all."""
 
 import contextlib
 import os
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -27,3 +28,26 @@ def replacing(path: Path) -> Iterator[Path]:
         raise UserError(f"{path}: cannot be written ({error.strerror}); expected a writable folder") from None
     finally:
         temporary.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def new_folder(path: Path) -> Iterator[Path]:
+    """A temporary folder beside `path` to fill; it becomes `path` if the block ends without an error.
+
+    Raises:
+        UserError: `path` exists and is no empty folder, or its place is not writable.
+    """
+    if path.is_symlink() or (path.exists() and (not path.is_dir() or any(path.iterdir()))):
+        raise UserError(f"{path}: exists already; expected a new or an empty folder to write to")
+    place = path.absolute()
+    try:
+        place.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=place.parent, prefix=f".{place.name}.", ignore_cleanup_errors=True) as top:
+            filled = Path(top) / place.name
+            filled.mkdir()
+            yield filled
+            if place.exists():
+                place.rmdir()
+            os.rename(filled, place)
+    except OSError as error:
+        raise UserError(f"{path}: cannot be written ({error.strerror}); expected a writable place") from None

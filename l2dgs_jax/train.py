@@ -15,6 +15,7 @@ from l2dgs_jax import checkpoint, cli, engine, runs, visualize
 from l2dgs_jax.checkpoint import Checkpoint
 from l2dgs_jax.config import PRESETS, Config
 from l2dgs_jax.data import load
+from l2dgs_jax.data.images import write_image
 from l2dgs_jax.errors import UserError
 
 LOG_EVERY = 10  # steps between lines of the metrics file
@@ -61,7 +62,7 @@ def train(arguments: Sequence[str]) -> None:
         ) from None
 
     run = runs.open_run(folder)
-    visualize.write_image(folder / runs.CONTACT_SHEET, visualize.contact_sheet(run))
+    write_image(folder / runs.CONTACT_SHEET, visualize.contact_sheet(run))
     visualize.video(run, folder / runs.VIDEO)
     print(f"wrote {folder / runs.CONTACT_SHEET} and {folder / runs.VIDEO}")
     print(f"next: python -m l2dgs_jax.evaluate {folder}   or   python -m l2dgs_jax.render {folder}")

@@ -8,11 +8,11 @@ from typing import Any
 import cv2
 import jax
 import numpy as np
-import OpenImageIO as oiio  # noqa: N813
-from jaxtyping import Float, Shaped, UInt8
+from jaxtyping import Float, UInt8
 from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
+from l2dgs_jax.data.images import to_bytes
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.files import replacing
 from l2dgs_jax.rendering import in_order
@@ -149,28 +149,10 @@ def expected_depth(output: RenderOutput) -> Float[np.ndarray, "H W"]:
     return np.where(alpha > 0, np.asarray(output.depth) / np.where(alpha > 0, alpha, 1), 0)
 
 
-def to_bytes(image: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape"]:
-    """Values in [0, 1], clipped, as rounded 8-bit integers."""
-    return np.round(np.clip(np.asarray(image, np.float32), 0, 1) * 255).astype(np.uint8)
-
-
 def viridis(values: Float[np.ndarray, "H W"], low: float, high: float) -> UInt8[np.ndarray, "H W 3"]:
     """Colours from dark violet at `low` to yellow at `high`; black and white print keeps the order."""
     scaled = (values - low) / (high - low) if high > low else np.zeros_like(values)
     return np.ascontiguousarray(cv2.applyColorMap(to_bytes(scaled), cv2.COLORMAP_VIRIDIS)[..., ::-1])
-
-
-def write_image(path: Path, image: Shaped[np.ndarray, "H W *C"]) -> None:
-    """Write an 8-bit or 16-bit integer image whole or not at all; the ending of `path` says the format.
-
-    Raises:
-        UserError: the file cannot be written.
-    """
-    pixels = oiio.ImageBuf(np.ascontiguousarray(image))
-    with replacing(path) as temporary:
-        if not pixels.write(str(temporary)):
-            reason = " ".join(f"{pixels.geterror()} {oiio.geterror()}".split())
-            raise UserError(f"{path}: cannot be written ({reason}); expected a picture's suffix and a writable folder")
 
 
 def write_video(path: Path, frames: Iterable[UInt8[np.ndarray, "H W 3"]], fps: int) -> None:

@@ -121,7 +121,7 @@ def test_images_of_any_depth_and_channels(tmp_path, dtype, channels):
     write_image(tmp_path / "a.png", pixels)
     expected = np.repeat(pixels[..., None], 3, -1) if channels is None else pixels[..., :3]
     np.testing.assert_allclose(images.read_image(tmp_path / "a.png"), expected / np.iinfo(dtype).max, atol=1e-6)
-    assert images.image_size(tmp_path / "a.png") == (6, 5)
+    assert images.read_header(tmp_path / "a.png") == ((6, 5), False, False)
 
 
 def test_truth_and_masks(tmp_path):

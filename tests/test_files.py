@@ -1,9 +1,9 @@
-"""Files that are written whole or not at all."""
+"""Files and folders that are written whole or not at all."""
 
 import pytest
 
 from l2dgs_jax.errors import UserError
-from l2dgs_jax.files import replacing
+from l2dgs_jax.files import new_folder, replacing
 
 
 def test_a_file_is_replaced_whole_or_not_at_all(tmp_path):
@@ -38,3 +38,35 @@ def test_a_file_that_cannot_take_its_place_is_a_clear_error_and_leaves_nothing_b
     with pytest.raises(UserError, match=r"file\.txt: cannot be written \(No space left on device\)"):
         fill_the_disk()
     assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_appears_whole_or_not_at_all(tmp_path):
+    def fill(path, then=None):
+        with new_folder(path) as place:
+            (place / "a.txt").write_text("a")
+            assert not path.exists() or not list(path.iterdir())
+            if then:
+                raise then
+
+    for error, raised in ((KeyError("x"), KeyError), (OSError(28, "No space left on device"), UserError)):
+        with pytest.raises(raised):
+            fill(tmp_path / "new", error)
+        assert not list(tmp_path.iterdir())
+    (tmp_path / "empty").mkdir()
+    for name in ("new", "deep/er", "empty"):
+        fill(tmp_path / name)
+        assert [path.name for path in (tmp_path / name).iterdir()] == ["a.txt"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["deep", "empty", "new"]
+
+
+def test_a_folder_does_not_take_the_place_of_anything(tmp_path):
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "mine").write_text("")
+    (tmp_path / "link").symlink_to(tmp_path / "elsewhere")
+    (tmp_path / "file").write_text("")
+    for name in ("full", "link", "file"):
+        with (
+            pytest.raises(UserError, match=f"{name}: exists already; expected a new or an empty folder"),
+            new_folder(tmp_path / name),
+        ):
+            raise AssertionError("entered")

@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from l2dgs_jax import visualize
+from l2dgs_jax.data import images
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.types import Camera, RenderOutput
 
@@ -210,7 +211,7 @@ def test_video_without_codec_is_a_clear_error(tmp_path, monkeypatch):
 @pytest.mark.parametrize("kind", [np.uint8, np.uint16])
 def test_written_images_read_back_exactly(tmp_path, shape, kind):
     image = np.random.default_rng(0).integers(0, np.iinfo(kind).max, shape, dtype=kind, endpoint=True)
-    visualize.write_image(tmp_path / "image.png", image)
+    images.write_image(tmp_path / "image.png", image)
     read = cv2.imread(str(tmp_path / "image.png"), cv2.IMREAD_UNCHANGED)
     np.testing.assert_array_equal(read if len(shape) == 2 else read[..., ::-1], image)
     assert read.dtype == kind
@@ -220,17 +221,17 @@ def test_written_images_read_back_exactly(tmp_path, shape, kind):
 def test_files_that_cannot_be_written_are_clear_errors(tmp_path):
     image = np.zeros((4, 4, 3), np.uint8)
     with pytest.raises(UserError, match=r"missing/image\.png.*expected an existing folder .*missing"):
-        visualize.write_image(tmp_path / "missing" / "image.png", image)
+        images.write_image(tmp_path / "missing" / "image.png", image)
     (tmp_path / "folder.png").mkdir()
     with pytest.raises(UserError, match=r"folder\.png: is a folder; expected a file"):
-        visualize.write_image(tmp_path / "folder.png", image)
+        images.write_image(tmp_path / "folder.png", image)
     with pytest.raises(UserError, match=r"image\.nosuchformat.*cannot be written"):
-        visualize.write_image(tmp_path / "image.nosuchformat", image)
+        images.write_image(tmp_path / "image.nosuchformat", image)
 
 
 def test_bytes_round_and_clip():
     values = np.array([-1.0, 0.0, 0.4 / 255, 0.6 / 255, 0.5, 1.0, 7.0])
-    np.testing.assert_array_equal(visualize.to_bytes(values), [0, 0, 0, 1, 128, 255, 255])
+    np.testing.assert_array_equal(images.to_bytes(values), [0, 0, 0, 1, 128, 255, 255])
 
 
 def test_viridis_brightens_with_the_value_and_stands_a_constant():

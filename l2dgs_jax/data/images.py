@@ -1,56 +1,117 @@
-"""Pictures as arrays: sRGB values in [0, 1], `[H W 3]`, read by OpenImageIO."""
+"""Pictures as arrays: sRGB values in [0, 1], `[H W 3]`, read and written by OpenImageIO."""
 
 from contextlib import closing
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 import OpenImageIO as oiio  # noqa: N813
-from jaxtyping import Float, Float32
+from jaxtyping import Bool, Float, Float32, Shaped, UInt8
 
 from l2dgs_jax.errors import UserError
+from l2dgs_jax.files import replacing
 
-SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
+SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".exr", ".hdr", ".bmp")
+
+
+class Header(NamedTuple):
+    """What a picture file says before its pixels.
+
+    Attributes:
+        size: width and height in pixels, upright.
+        turned: whether its EXIF orientation swaps the two.
+        linear: whether it holds linear light instead of sRGB values.
+    """
+
+    size: tuple[int, int]
+    turned: bool
+    linear: bool
 
 
 def read_image(path: Path) -> Float32[np.ndarray, "H W 3"]:
-    """Read a picture of 8 or 16 bits, grey or colour; alpha is dropped, not multiplied in.
+    """Read a picture, grey or colour, upright; alpha is dropped, not multiplied in.
+
+    Integers of any depth are sRGB values, as cameras write them. Floating-point values (EXR, Radiance HDR, TIFF) are
+    linear light unless the file says otherwise: they are clipped to [0, 1] and converted.
 
     Raises:
-        UserError: the file is missing or cannot be read whole.
+        UserError: the file is missing, cannot be read whole, or holds values that are not finite.
     """
+    return read_image_and_alpha(path)[0]
+
+
+def read_image_and_alpha(path: Path) -> tuple[Float32[np.ndarray, "H W 3"], Float32[np.ndarray, "H W 1"] | None]:
+    """Like `read_image`, with the alpha channel if there is one."""
     with closing(_open(path)) as file:
+        spec = file.spec()
         pixels = file.read_image(oiio.FLOAT)
         if pixels is None:
             raise UserError(f"{path}: expected a readable picture, but it is damaged ({_reason(file.geterror())})")
+    pixels = _upright(np.asarray(pixels, np.float32), _orientation(spec))
+    if _is_float(spec) and not np.isfinite(pixels).all():
+        raise UserError(f"{path}: holds NaN or infinite values; expected finite colours")
     channels = [0, 1, 2] if pixels.shape[-1] >= 3 else [0, 0, 0]
-    return np.asarray(pixels[..., channels], np.float32)
+    color = np.ascontiguousarray(pixels[..., channels])
+    alpha = spec.alpha_channel
+    return (
+        srgb_from_linear(color) if _is_linear(spec) else color,
+        None if alpha < 0 else np.ascontiguousarray(pixels[..., alpha : alpha + 1]),
+    )
 
 
-def image_size(path: Path) -> tuple[int, int]:
-    """Width and height of a picture, from its header.
+def read_header(path: Path) -> Header:
+    """What a picture's header says.
 
     Raises:
         UserError: the file is missing or no picture.
     """
     with closing(_open(path)) as file:
-        return file.spec().width, file.spec().height
+        spec = file.spec()
+        turned = _orientation(spec) >= 5
+        size = (spec.height, spec.width) if turned else (spec.width, spec.height)
+        return Header(size, turned, _is_linear(spec))
 
 
-def area_average(image: Float32[np.ndarray, "H W 3"], factor: int) -> Float32[np.ndarray, "h w 3"]:
+def write_image(path: Path, image: Shaped[np.ndarray, "H W *C"]) -> None:
+    """Write an 8-bit or 16-bit integer image whole or not at all; the ending of `path` says the format.
+
+    Raises:
+        UserError: the file cannot be written.
+    """
+    pixels = oiio.ImageBuf(np.ascontiguousarray(image))
+    pixels.specmod().attribute("oiio:UnassociatedAlpha", 1)
+    with replacing(path) as temporary:
+        if not pixels.write(str(temporary)):
+            reason = _reason(f"{pixels.geterror()} {oiio.geterror()}")
+            raise UserError(f"{path}: cannot be written ({reason}); expected a picture's suffix and a writable folder")
+
+
+def to_bytes(image: Float[np.ndarray, "*shape"] | Bool[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape"]:
+    """Values in [0, 1], clipped, as rounded 8-bit integers."""
+    return np.round(np.clip(np.asarray(image, np.float32), 0, 1) * 255).astype(np.uint8)
+
+
+def srgb_from_linear(light: Float32[np.ndarray, "*shape"]) -> Float32[np.ndarray, "*shape"]:
+    """The sRGB values (IEC 61966-2-1) of linear light, clipped to [0, 1]."""
+    light = np.clip(light, 0, 1)
+    return np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** np.float32(1 / 2.4) - 0.055)
+
+
+def area_average(image: Float32[np.ndarray, "H W C"], factor: int) -> Float32[np.ndarray, "h w C"]:
     """Shrink by a whole factor, each pixel the mean of a block.
 
     Rows and columns that fill no block are cropped from the bottom and the right, so that dividing K by `factor`
     stays exact.
     """
     height, width = image.shape[0] // factor, image.shape[1] // factor
-    blocks = image[: height * factor, : width * factor].reshape(height, factor, width, factor, 3)
+    blocks = image[: height * factor, : width * factor].reshape(height, factor, width, factor, -1)
     return blocks.mean((1, 3))
 
 
 def undistort(
-    image: Float32[np.ndarray, "H W 3"], K: Float[np.ndarray, "3 3"], distortion: Float[np.ndarray, "5"]
-) -> Float32[np.ndarray, "H W 3"]:
+    image: Float32[np.ndarray, "H W C"], K: Float[np.ndarray, "3 3"], distortion: Float[np.ndarray, "5"]
+) -> Float32[np.ndarray, "H W C"]:
     """The picture that the pinhole camera `without_skew(K)` would have taken.
 
     Pixels that the lens did not see repeat the nearest one that it did.
@@ -74,7 +135,7 @@ def undistort(
     columns = (K[0, 0] * lens_x + K[0, 1] * lens_y + K[0, 2] - 0.5).astype(np.float32)
     rows = (K[1, 1] * lens_y + K[1, 2] - 0.5).astype(np.float32)
     warped = cv2.remap(image, columns, rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-    return np.clip(warped, 0, 1)  # cubic interpolation overshoots
+    return np.clip(warped.reshape(image.shape), 0, 1)  # cubic interpolation overshoots
 
 
 def scale_intrinsics(K: Float[np.ndarray, "3 3"], factor: int) -> Float[np.ndarray, "3 3"]:
@@ -97,6 +158,29 @@ def _open(path: Path) -> oiio.ImageInput:
     if file is None:
         raise UserError(f"{path}: expected a readable picture ({_reason(oiio.geterror())})")
     return file
+
+
+def _orientation(spec: oiio.ImageSpec) -> int:
+    """EXIF's number from 1 (upright) to 8."""
+    value = spec.getattribute("Orientation")
+    return value if isinstance(value, int) and 1 <= value <= 8 else 1
+
+
+def _upright(pixels: Float32[np.ndarray, "h w C"], orientation: int) -> Float32[np.ndarray, "H W C"]:
+    """The picture as it is to be seen, given EXIF's orientation of its stored rows and columns."""
+    if orientation >= 5:
+        pixels = pixels.transpose(1, 0, 2)
+    flip_rows = orientation in (3, 4, 7, 8)
+    flip_columns = orientation in (2, 3, 6, 7)
+    return pixels[:: -1 if flip_rows else 1, :: -1 if flip_columns else 1]
+
+
+def _is_float(spec: oiio.ImageSpec) -> bool:
+    return spec.format.basetype in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE)
+
+
+def _is_linear(spec: oiio.ImageSpec) -> bool:
+    return _is_float(spec) and "srgb" not in str(spec.getattribute("oiio:ColorSpace") or "").lower()
 
 
 def _reason(message: str) -> str:

@@ -1,26 +1,25 @@
-"""Reader of the layout of Nerfies (arXiv 2011.12948), HyperNeRF and their kin.
+"""The layout of Nerfies (arXiv 2011.12948), HyperNeRF, DyCheck (arXiv 2210.13445) and their kin.
 
     camera/<id>.json   rgb/<k>x/<id>.png   dataset.json   [metadata.json]   [scene.json]
-    points.npy   [points_rgb.npy]   [well/<k>x/<id>.png]   [mask/<k>x/<id>.png]
+    points.npy   [points_rgb.npy]
 
-Instead of the lists in `dataset.json` there may be `splits/{train,val}.json` (DyCheck, arXiv 2210.13445).
+Instead of the lists in `dataset.json` there may be `splits/{train,val}.json`. The alpha of DyCheck's pictures says
+which pixels are valid; its depth is not read.
 """
 
-import json
-import re
-import reprlib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from l2dgs_jax.data.dataset import Dataset, Frame, Picture, assemble
-from l2dgs_jax.data.images import SUFFIXES
+from l2dgs_jax.data.assembly import Frame, assemble
+from l2dgs_jax.data.dataset import Dataset
+from l2dgs_jax.data.parsing import name_list, numbers, read_array, read_json, value
+from l2dgs_jax.data.pictures import Picture, stored
+from l2dgs_jax.data.writing import write_json, write_lists, write_pictures
 from l2dgs_jax.errors import UserError
-
-_SCALE = re.compile(r"([1-9]\d*)x")
-_JSON_NAMES: dict[type, str] = {dict: "object", list: "array"}
+from l2dgs_jax.files import new_folder
 
 
 def recognizes(folder: Path) -> bool:
@@ -43,32 +42,32 @@ def read(folder: Path, downscale: int) -> Dataset:
     points, colors = _points(folder)
 
     def frames(names: list[str]) -> list[Frame]:
-        kinds = [_pictures(folder / kind, downscale, names, kind != "rgb") for kind in ("rgb", "well", "mask")]
+        pictures = stored(folder / "rgb", downscale, names)
         return [
-            _frame(folder / "camera" / f"{name}.json", center, scale, times[name], *pictures)
-            for name, *pictures in zip(names, *kinds, strict=True)
+            _frame(folder, name, center, scale, times[name], picture)
+            for name, picture in zip(names, pictures, strict=True)
         ]
 
-    world = ((points - center) * scale).astype(np.float32)
-    return assemble(folder.resolve().name, frames(train), frames(val), world, colors, downscale)
+    world = (points - center) * scale
+    return assemble(folder, frames(train), frames(val), world, colors, downscale)
 
 
 def _split(folder: Path) -> tuple[list[str], list[str], dict[str, float]]:
     """Identifiers of the training and the held-out frames, and the instant of every listed frame."""
     path = folder / "dataset.json"
     has_splits = (folder / "splits").is_dir()
-    content = {} if has_splits and not path.exists() else _read_json(path, "the lists of frames")
+    content = {} if has_splits and not path.exists() else read_json(path, "the lists of frames")
     if has_splits and not {"ids", "train_ids"} & content.keys():
         path = folder / "splits" / "val.json"
         train, val = (
-            _names(file, _read_json(file, "a list of frames"), "frame_names")
+            name_list(file, read_json(file, "a list of frames"), "frame_names")
             for file in (path.with_name("train.json"), path)
         )
         ids: list[str] = []
     else:
-        ids = _names(path, content, "ids") if "ids" in content else []
-        train = _names(path, content, "train_ids") if "train_ids" in content or not ids else []
-        val = _names(path, content, "val_ids") if "val_ids" in content else []
+        ids = name_list(path, content, "ids") if "ids" in content else []
+        train = name_list(path, content, "train_ids") if "train_ids" in content or not ids else []
+        val = name_list(path, content, "val_ids") if "val_ids" in content else []
     listed = ids if set(train + val) <= set(ids) else sorted({*train, *val})
     if not val:
         # The rule of 4DGS (arXiv 2310.08528) for clips of one camera: train on every fourth frame, score halfway.
@@ -82,11 +81,13 @@ def _split(folder: Path) -> tuple[list[str], list[str], dict[str, float]]:
 
 
 def _times(path: Path, names: list[str]) -> dict[str, float]:
-    """Instants in [0, 1] from warp_id, else from time_id, else from the order of the frames."""
-    metadata = _read_json(path, "the frames' instants") if path.exists() else {}
-    entries = [_value(path, metadata, name, dict) for name in names] if metadata else []
-    key = next((key for key in ("warp_id", "time_id") if any(key in entry for entry in entries)), None)
-    moments = np.array([_numbers(path, entry, key, ()) for entry in entries] if key else range(len(names)), float)
+    """Instants in [0, 1]: `time` as it is, else warp_id or time_id spread over [0, 1], else the order of the frames."""
+    metadata = read_json(path, "the frames' instants") if path.exists() else {}
+    entries = [value(path, metadata, name, dict) for name in names] if metadata else []
+    key = next((key for key in ("time", "warp_id", "time_id") if any(key in entry for entry in entries)), None)
+    moments = np.array([numbers(path, entry, key, ()) for entry in entries] if key else range(len(names)), float)
+    if key == "time" and moments.min() >= 0 and moments.max() <= 1:
+        return dict(zip(names, moments.tolist(), strict=True))
     span = np.ptp(moments) or 1.0
     return dict(zip(names, ((moments - moments.min()) / span).tolist(), strict=True))
 
@@ -96,22 +97,22 @@ def _normalization(folder: Path) -> tuple[Float64[np.ndarray, "3"], float]:
     path = folder / "scene.json"
     if not path.exists():
         return np.zeros(3), 1.0
-    content = _read_json(path, "center and scale")
-    scale = float(_numbers(path, content, "scale", ()))
+    content = read_json(path, "center and scale")
+    scale = float(numbers(path, content, "scale", ()))
     if scale <= 0:
         raise UserError(f"{path}: 'scale' is {scale}; expected a positive number")
-    return _numbers(path, content, "center", (3,)), scale
+    return numbers(path, content, "center", (3,)), scale
 
 
 def _points(folder: Path) -> tuple[Float64[np.ndarray, "P 3"], Float32[np.ndarray, "P 3"] | None]:
     """Points as stored, and their colours from a file of their own or from columns 4 to 6."""
     path = folder / "points.npy"
-    rows = _read_array(path, "the scene's surface points, shape (P, 3)")
+    rows = read_array(path, "the scene's surface points, shape (P, 3)")
     if rows.ndim != 2 or rows.shape[1] not in (3, 6) or not len(rows):
         raise UserError(f"{path}: the array has shape {rows.shape}; expected (P, 3) or (P, 6) with at least one point")
     colors_path = folder / "points_rgb.npy"
     if colors_path.exists():
-        colors = _read_array(colors_path, "the points' colours")
+        colors = read_array(colors_path, "the points' colours")
         if colors.shape != (len(rows), 3):
             raise UserError(f"{colors_path}: the array has shape {colors.shape}; expected {(len(rows), 3)}")
     elif rows.shape[1] == 6:
@@ -124,124 +125,78 @@ def _points(folder: Path) -> tuple[Float64[np.ndarray, "P 3"], Float32[np.ndarra
     return rows[:, :3].astype(np.float64), (colors / unit).astype(np.float32)
 
 
-def _pictures(root: Path, downscale: int, names: list[str], optional: bool) -> list[Picture] | list[None]:
-    """The picture of every frame, from the smallest stored size that a whole factor still shrinks to `downscale`."""
-    if optional and not root.is_dir():
-        return [None] * len(names)
-    held = [match[1] for match in map(_SCALE.fullmatch, _listing(root)) if match]
-    scale = max((int(factor) for factor in held if downscale % int(factor) == 0), default=0)
-    if not scale:
-        found = ", ".join(f"{factor}x" for factor in held) or "no folder like 1x"
-        raise UserError(f"{root}: holds {found}; expected a factor that divides --downscale {downscale}")
-    folder = root / f"{scale}x"
-    files = {Path(file).stem: folder / file for file in _listing(folder) if Path(file).suffix.lower() in SUFFIXES}
-    missing = [name for name in names if name not in files]
-    if optional and len(missing) == len(names):
-        return [None] * len(names)
-    if missing:
-        raise UserError(f"{folder / missing[0]}.png: no such file; expected the picture of frame '{missing[0]}'")
-    return [Picture(files[name], scale) for name in names]
-
-
 def _frame(
-    path: Path,
-    center: Float64[np.ndarray, "3"],
-    scale: float,
-    time: float,
-    image: Picture,
-    welllit: Picture | None,
-    mask: Picture | None,
+    folder: Path, name: str, center: Float64[np.ndarray, "3"], scale: float, time: float, image: Picture
 ) -> Frame:
     """A frame from its camera file."""
-    content = _read_json(path, f"the camera of frame '{path.stem}'")
+    path = folder / "camera" / f"{name}.json"
+    content = read_json(path, f"the camera of frame '{name}'")
     tangential = "tangential" if "tangential" in content else "tangential_distortion"  # the first is the older key
     optional = {"skew": 0.0, "pixel_aspect_ratio": 1.0, "radial_distortion": [0.0] * 3, tangential: [0.0] * 2}
     content = optional | content
 
-    rotation = _numbers(path, content, "orientation", (3, 3))
+    rotation = numbers(path, content, "orientation", (3, 3))
     if not (np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) and np.linalg.det(rotation) > 0):
         raise UserError(f"{path}: 'orientation' is no rotation; expected an orthonormal matrix of determinant 1")
-    position = (_numbers(path, content, "position", (3,)) - center) * scale
+    position = (numbers(path, content, "position", (3,)) - center) * scale
     viewmat = np.eye(4)
     viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ position
 
-    focal, aspect = (float(_numbers(path, content, key, ())) for key in ("focal_length", "pixel_aspect_ratio"))
+    focal, aspect = (float(numbers(path, content, key, ())) for key in ("focal_length", "pixel_aspect_ratio"))
     if focal <= 0 or aspect <= 0:
         raise UserError(
             f"{path}: 'focal_length' is {focal} and 'pixel_aspect_ratio' {aspect}; expected positive numbers"
         )
-    skew = float(_numbers(path, content, "skew", ()))
-    u, v = _numbers(path, content, "principal_point", (2,))
-    k1, k2, k3 = _numbers(path, content, "radial_distortion", (3,))
-    width, height = _numbers(path, content, "image_size", (2,))
+    skew = float(numbers(path, content, "skew", ()))
+    u, v = numbers(path, content, "principal_point", (2,))
+    k1, k2, k3 = numbers(path, content, "radial_distortion", (3,))
+    width, height = numbers(path, content, "image_size", (2,))
     if min(width, height) < 1 or width % 1 or height % 1:
         raise UserError(f"{path}: 'image_size' is {width} by {height}; expected whole positive numbers of pixels")
     return Frame(
-        name=path.stem,
+        name=name,
         source=path,
         viewmat=viewmat,
         K=np.array([[focal, skew, u], [0, focal * aspect, v], [0, 0, 1]]),
-        distortion=np.array([k1, k2, *_numbers(path, content, tangential, (2,)), k3]),
+        distortion=np.array([k1, k2, *numbers(path, content, tangential, (2,)), k3]),
         size=(int(width), int(height)),
         time=time,
         image=image,
-        welllit=welllit,
-        mask=mask,
     )
 
 
-def _listing(folder: Path) -> list[str]:
-    if not folder.is_dir():
-        raise UserError(f"{folder}: no such folder; expected pictures in {folder / '1x'}")
-    return sorted(entry.name for entry in folder.iterdir())
+def write(dataset: Dataset, folder: Path) -> None:
+    """Write a scene so that `read` gives it back: cameras, instants and points exactly, pictures rounded to 8 bits.
+
+    Raises:
+        UserError: the folder holds files already or cannot be written.
+    """
+    with new_folder(folder) as place:
+        write_pictures(dataset, place / "rgb" / "1x", place)
+        write_lists(dataset, place)
+        write_json(place / "scene.json", {"center": [0.0, 0.0, 0.0], "scale": 1.0})
+        np.save(place / "points.npy", dataset.points)
+        if dataset.colors is not None:
+            np.save(place / "points_rgb.npy", dataset.colors)
+        for split in (dataset.train, dataset.test):
+            for name, viewmat, K in zip(split.names, split.cameras.viewmat, split.cameras.K, strict=True):
+                write_json(
+                    place / "camera" / f"{name}.json",
+                    _camera(np.asarray(viewmat, np.float64), np.asarray(K, np.float64))
+                    | {"image_size": [dataset.width, dataset.height]},
+                )
 
 
-def _read_json(path: Path, what: str) -> dict[str, Any]:
-    if not path.is_file():
-        raise UserError(f"{path}: no such file; expected {what}")
-    try:
-        content = json.loads(path.read_bytes())
-    except (OSError, ValueError) as error:
-        raise UserError(f"{path}: cannot be read as JSON ({error}); expected {what}") from None
-    if not isinstance(content, dict):
-        raise UserError(f"{path}: holds a JSON {type(content).__name__}; expected an object with {what}")
-    return content
-
-
-def _read_array(path: Path, what: str) -> np.ndarray:
-    if not path.is_file():
-        raise UserError(f"{path}: no such file; expected {what}")
-    try:
-        values = np.load(path, allow_pickle=False)
-        finite = np.isfinite(values).all()
-    except (ValueError, EOFError, OSError, TypeError) as error:
-        raise UserError(f"{path}: not a NumPy array of numbers ({error}); expected {what}") from None
-    if not finite:
-        raise UserError(f"{path}: holds NaN or infinite values; expected finite numbers")
-    return values
-
-
-def _value(path: Path, content: dict[str, Any], key: str, kind: type) -> Any:
-    if key not in content:
-        raise UserError(f"{path}: '{key}' is missing; expected a JSON {_JSON_NAMES[kind]}")
-    if not isinstance(content[key], kind):
-        raise UserError(f"{path}: '{key}' is {reprlib.repr(content[key])}; expected a JSON {_JSON_NAMES[kind]}")
-    return content[key]
-
-
-def _names(path: Path, content: dict[str, Any], key: str) -> list[str]:
-    return [str(name) for name in _value(path, content, key, list)]
-
-
-def _numbers(path: Path, content: dict[str, Any], key: str, shape: tuple[int, ...]) -> Float64[np.ndarray, "..."]:
-    """A finite array of that shape."""
-    wanted = f"{'x'.join(map(str, shape))} numbers" if shape else "a number"
-    if key not in content:
-        raise UserError(f"{path}: '{key}' is missing; expected {wanted}")
-    try:
-        values = np.asarray(content[key], np.float64)
-    except (TypeError, ValueError):
-        values = np.array(np.nan)
-    if values.shape != shape or not np.isfinite(values).all():
-        raise UserError(f"{path}: '{key}' is {reprlib.repr(content[key])}; expected {wanted}, finite")
-    return values
+def _camera(viewmat: Float64[np.ndarray, "4 4"], K: Float64[np.ndarray, "3 3"]) -> dict[str, Any]:
+    """A camera file without the size."""
+    rotation, translation = viewmat[:3, :3], viewmat[:3, 3]
+    return {
+        "orientation": rotation.tolist(),
+        "position": np.linalg.solve(rotation, -translation).tolist(),
+        "focal_length": K[0, 0],
+        "pixel_aspect_ratio": K[1, 1] / K[0, 0],
+        "principal_point": K[:2, 2].tolist(),
+        "skew": 0.0,
+        "radial_distortion": [0.0] * 3,
+        "tangential_distortion": [0.0] * 2,
+    }

@@ -1,0 +1,203 @@
+"""From frames as a reader describes them to the data set in memory."""
+
+import os
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+import numpy as np
+from jaxtyping import Bool, Float, Float16, Float32
+
+from l2dgs_jax.data import images
+from l2dgs_jax.data.dataset import Dataset, Split
+from l2dgs_jax.data.pictures import Picture, stored_if_any
+from l2dgs_jax.errors import UserError
+from l2dgs_jax.types import Camera
+
+LINEAR_NOTE = "pictures of floating-point values are taken as linear light and converted to sRGB"
+
+_T = TypeVar("_T")
+_U = TypeVar("_U")
+
+
+@dataclass(frozen=True)
+class Frame:
+    """What a reader knows of a frame before any picture is read.
+
+    Attributes:
+        name: of the frame.
+        source: the file that describes its camera, for messages.
+        viewmat: world to camera, rigid.
+        K: intrinsics in pixels of the full size.
+        distortion: (k1, k2, p1, p2, k3), see `images.undistort`.
+        size: full width and height in pixels.
+        time: instant in [0, 1].
+        image: the low-light picture.
+        alpha: what its alpha means: which pixels count, or how much of each the scene covers before a black
+            background.
+    """
+
+    name: str
+    source: Path
+    viewmat: Float[np.ndarray, "4 4"]
+    K: Float[np.ndarray, "3 3"]
+    distortion: Float[np.ndarray, "5"]
+    size: tuple[int, int]
+    time: float
+    image: Picture
+    alpha: Literal["validity", "coverage"] = "validity"
+
+
+def assemble(
+    folder: Path,
+    train: Sequence[Frame],
+    test: Sequence[Frame],
+    points: Float[np.ndarray, "P 3"],
+    colors: Float[np.ndarray, "P 3"] | None,
+    downscale: int,
+    notes: tuple[str, ...] = (),
+) -> Dataset:
+    """Read the pictures of the frames, undistorted and `downscale` times smaller than the cameras' full size.
+
+    Whatever the layout, `well/<k>x/<name>.png`, `mask/<k>x/<name>.png` and `covisible/<k>x/{train,val}/<name>.png` in
+    the scene's folder are the frames' truth and masks.
+
+    Args:
+        folder: of the scene.
+        train: frames to learn from.
+        test: held-out frames.
+        points: surface points, world units.
+        colors: of the points, in [0, 1].
+        downscale: every picture's own scale divides it.
+        notes: what the reader assumed.
+
+    Raises:
+        UserError: a picture is missing, damaged, or of another size than its camera or the other pictures; or a camera
+            or point lies beyond what single precision can hold.
+    """
+    frames = [*train, *test]
+    full = _common_size(frames)
+    if min(full) < downscale:
+        raise UserError(f"--downscale {downscale}: expected at most {min(full)}, the images' shorter side")
+    if _check_pictures([frame.image for frame in frames], full):
+        notes = (*notes, LINEAR_NOTE)
+    width, height = full[0] // downscale, full[1] // downscale
+    return Dataset(
+        name=folder.resolve().name,
+        width=width,
+        height=height,
+        train=_read_split(folder, "train", train, width, height, downscale),
+        test=_read_split(folder, "val", test, width, height, downscale),
+        points=_single(points, f"{folder}: a point"),
+        colors=colors,
+        notes=notes,
+    )
+
+
+def _common_size(frames: Sequence[Frame]) -> tuple[int, int]:
+    first = frames[0]
+    for frame in frames:
+        if frame.size != first.size:
+            raise UserError(
+                f"{frame.source}: the image size is {_by(frame.size)}; expected {_by(first.size)} as in {first.source}"
+            )
+    return first.size
+
+
+def _check_pictures(pictures: Sequence[Picture], full: tuple[int, int]) -> bool:
+    """Compare every picture's header with the cameras' full size; whether any picture holds linear light."""
+    headers = _parallel(lambda picture: images.read_header(picture.path), pictures)
+    for picture, header in zip(pictures, headers, strict=True):
+        exact = (full[0] / picture.scale, full[1] / picture.scale)
+        if any(abs(actual - wanted) >= 1 for actual, wanted in zip(header.size, exact, strict=True)):
+            turned = " once turned as its EXIF orientation says" if header.turned else ""
+            raise UserError(
+                f"{picture.path}: the picture is {_by(header.size)}{turned}; expected "
+                f"{_by((round(exact[0]), round(exact[1])))} as the cameras say"
+            )
+    return any(header.linear for header in headers)
+
+
+def _read_split(folder: Path, part: str, frames: Sequence[Frame], width: int, height: int, downscale: int) -> Split:
+    """Read the pictures of one split; truth and masks that no frame has are None."""
+    names = [frame.name for frame in frames]
+
+    def fit(frame: Frame, scale: int, image: Float32[np.ndarray, "h w C"]) -> Float32[np.ndarray, "H W C"]:
+        straight = images.undistort(image, images.scale_intrinsics(frame.K, scale), frame.distortion)
+        return images.area_average(straight, downscale // scale)[:height, :width]
+
+    def read_all(root: Path, prefix: str = "") -> Float16[np.ndarray, "F H W 3"] | None:
+        pictures = stored_if_any(root, downscale, [prefix + name for name in names])
+        found = [picture for picture in pictures if picture]
+        if not found:
+            return None
+        _check_pictures(found, frames[0].size)
+        read = lambda i: fit(frames[i], found[i].scale, images.read_image(found[i].path))
+        return _filled(read, (len(frames), height, width, 3))
+
+    def majority(values: Float16[np.ndarray, "F H W 3"] | None) -> Bool[np.ndarray, "F H W"] | None:
+        return None if values is None else values[..., 0] > 0.5
+
+    valid = np.ones((len(frames), height, width), bool)
+
+    def read_frame(index: int) -> Float32[np.ndarray, "H W 3"]:
+        frame = frames[index]
+        image, alpha = images.read_image_and_alpha(frame.image.path)
+        if alpha is not None and frame.alpha == "coverage":
+            image *= alpha
+        elif alpha is not None and frame.alpha == "validity":
+            # A pixel counts if nothing that it was made from is marked.
+            valid[index] = fit(frame, frame.image.scale, (alpha > 0.5).astype(np.float32))[..., 0] > 0.999
+        return fit(frame, frame.image.scale, image)
+
+    lowlight = _filled(read_frame, (len(frames), height, width, 3))
+    K = [images.scale_intrinsics(images.without_skew(frame.K), downscale) for frame in frames]
+    return Split(
+        names=tuple(names),
+        cameras=Camera(
+            viewmat=_stacked([frame.viewmat for frame in frames], frames),
+            K=_stacked(K, frames),
+            time=_stacked([np.array(frame.time) for frame in frames], frames),
+        ),
+        images=lowlight,
+        welllit=read_all(folder / "well"),
+        masks=majority(read_all(folder / "mask")),
+        valid=None if valid.all() else valid,
+        covisible=majority(read_all(folder / "covisible", f"{part}/")),
+    )
+
+
+def _filled(
+    read: Callable[[int], Float32[np.ndarray, "H W 3"]], shape: tuple[int, int, int, int]
+) -> Float16[np.ndarray, "F H W 3"]:
+    """Stack what `read` returns for each frame, without ever holding it twice."""
+    stacked = np.empty(shape, np.float16)
+
+    def fill(index: int) -> None:
+        stacked[index] = read(index)
+
+    _parallel(fill, range(shape[0]))
+    return stacked
+
+
+def _parallel(function: Callable[[_T], _U], items: Iterable[_T]) -> list[_U]:
+    """Map on threads: decoding and resampling release the interpreter lock."""
+    with ThreadPoolExecutor(max_workers=min(os.cpu_count() or 1, 8)) as pool:
+        return list(pool.map(function, items))
+
+
+def _stacked(values: Sequence[np.ndarray], frames: Sequence[Frame]) -> Any:
+    """Stacked as float32; `Any` because `Camera` declares jax arrays and these are NumPy's."""
+    return np.stack([_single(x, f"{frame.source}: the camera") for x, frame in zip(values, frames, strict=True)])
+
+
+def _single(values: Float[np.ndarray, "*S"], what: str) -> Float32[np.ndarray, "*S"]:
+    if not (np.abs(values) < 1e18).all():  # squares must fit as well
+        raise UserError(f"{what} holds values beyond 1e18 or not finite; expected a scene of moderate size")
+    return values.astype(np.float32)
+
+
+def _by(size: tuple[int, int]) -> str:
+    return f"{size[0]}x{size[1]} pixels"

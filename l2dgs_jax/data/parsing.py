@@ -1,0 +1,90 @@
+"""Values from JSON and NumPy files, or one sentence on what is wrong with them."""
+
+import json
+import reprlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+
+from l2dgs_jax.errors import UserError
+
+_JSON_NAMES: dict[type, str] = {dict: "object", list: "array", str: "string"}
+
+
+def read_json(path: Path, what: str) -> dict[str, Any]:
+    """The object in a JSON file; `what` says what it should describe.
+
+    Raises:
+        UserError: the file is missing, no JSON, or holds something else.
+    """
+    if not path.is_file():
+        raise UserError(f"{path}: no such file; expected {what}")
+    try:
+        content = json.loads(path.read_bytes())
+    except (OSError, ValueError, RecursionError) as error:
+        raise UserError(f"{path}: cannot be read as JSON ({error}); expected {what}") from None
+    if not isinstance(content, dict):
+        raise UserError(f"{path}: holds a JSON {type(content).__name__}; expected an object with {what}")
+    return content
+
+
+def read_array(path: Path, what: str) -> np.ndarray:
+    """The finite real numbers in an .npy file; `what` says what they should be.
+
+    Raises:
+        UserError: the file is missing, damaged, or holds something else.
+    """
+    if not path.is_file():
+        raise UserError(f"{path}: no such file; expected {what}")
+    try:
+        values = np.load(path, allow_pickle=False)
+    except Exception as error:  # a damaged header makes NumPy raise any of a dozen kinds
+        reason = str(error).partition("\n")[0]
+        raise UserError(f"{path}: not a NumPy array of numbers ({reason}); expected {what}") from None
+    if not isinstance(values, np.ndarray) or values.dtype.kind not in "iuf":
+        raise UserError(f"{path}: not a NumPy array of numbers; expected {what}")
+    if not np.isfinite(values).all():
+        raise UserError(f"{path}: holds NaN or infinite values; expected finite numbers")
+    return values
+
+
+def value(path: Path, content: dict[str, Any], key: str, kind: type) -> Any:
+    """The value of a key, of that JSON type.
+
+    Raises:
+        UserError: it is missing or of another type.
+    """
+    if key not in content:
+        raise UserError(f"{path}: '{key}' is missing; expected a JSON {_JSON_NAMES[kind]}")
+    if not isinstance(content[key], kind):
+        raise UserError(f"{path}: '{key}' is {reprlib.repr(content[key])}; expected a JSON {_JSON_NAMES[kind]}")
+    return content[key]
+
+
+def name_list(path: Path, content: dict[str, Any], key: str) -> list[str]:
+    """The names that a key lists.
+
+    Raises:
+        UserError: it is missing or no list.
+    """
+    return [str(name) for name in value(path, content, key, list)]
+
+
+def numbers(path: Path, content: dict[str, Any], key: str, shape: tuple[int, ...]) -> Float64[np.ndarray, "..."]:
+    """The finite numbers of a key, as an array of that shape.
+
+    Raises:
+        UserError: it is missing or something else.
+    """
+    wanted = f"{'x'.join(map(str, shape))} numbers" if shape else "a number"
+    if key not in content:
+        raise UserError(f"{path}: '{key}' is missing; expected {wanted}")
+    try:
+        values = np.asarray(content[key], np.float64)
+    except (TypeError, ValueError, OverflowError):
+        values = np.array(np.nan)
+    if values.shape != shape or not np.isfinite(values).all():
+        raise UserError(f"{path}: '{key}' is {reprlib.repr(content[key])}; expected {wanted}, finite")
+    return values

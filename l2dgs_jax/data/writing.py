@@ -1,0 +1,59 @@
+"""What the writers of all layouts share: pictures, truth and masks, lists of frames and instants."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Shaped
+
+from l2dgs_jax.data.dataset import Dataset
+from l2dgs_jax.data.images import to_bytes, write_image
+
+
+def write_pictures(dataset: Dataset, root: Path, folder: Path) -> None:
+    """Write the frames as `root/<name>.png`, alpha 0 where they are not valid, and what `assemble` finds in `folder`.
+
+    Raises:
+        UserError: a file cannot be written.
+    """
+    for part, split in (("train", dataset.train), ("val", dataset.test)):
+        kinds: list[tuple[Path, Any]] = [
+            (folder / "well" / "1x", split.welllit),
+            (folder / "mask" / "1x", split.masks),
+            (folder / "covisible" / "1x" / part, split.covisible),
+        ]
+        for i, name in enumerate(split.names):
+            pixels = to_bytes(split.images[i])
+            if split.valid is not None:
+                pixels = np.dstack([pixels, to_bytes(split.valid[i])])
+            _write(root / f"{name}.png", pixels)
+            for place, values in kinds:
+                if values is not None:
+                    _write(place / f"{name}.png", to_bytes(values[i]))
+
+
+def write_lists(dataset: Dataset, folder: Path) -> None:
+    """Write `dataset.json`, which frames are held out, and `metadata.json`, their instants."""
+    train, val = dataset.train, dataset.test
+    times = {
+        name: float(time) for split in (train, val) for name, time in zip(split.names, split.cameras.time, strict=True)
+    }
+    lists = {"count": len(times), "ids": sorted(times), "train_ids": train.names, "val_ids": val.names}
+    instants = {time: rank for rank, time in enumerate(sorted(set(times.values())))}
+    write_json(folder / "dataset.json", lists)
+    # Other programs know whole numbers only.
+    write_json(
+        folder / "metadata.json", {name: {"warp_id": instants[time], "time": time} for name, time in times.items()}
+    )
+
+
+def write_json(path: Path, content: object) -> None:
+    """Write a JSON file, making its folder."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(content, indent=2) + "\n")
+
+
+def _write(path: Path, pixels: Shaped[np.ndarray, "H W *C"]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_image(path, pixels)
