@@ -21,10 +21,10 @@ from l2dgs_jax.data.images import read_image
 from l2dgs_jax.optim import Schedule
 
 PHOTOGRAPHS = ("astronaut", "camera", "chelsea", "coffee", "rocket")
-CROP, BATCH = 96, 6  # pixels, images
+CROP, BATCH = 64, 8  # pixels, images
 EXPOSURES = (0.02, 0.3)  # drawn log-uniformly
 SHRINK = (1.0, 2.2)  # shorter side of a picture over CROP
-TONE = (0.5, 1.8)  # exponent of each crop, so that pictures of every brightness are seen
+TONE = (0.6, 1.6)  # exponent of each crop, so that pictures of every brightness are seen
 RATES = (2e-3, 1e-4)  # first and last learning rate
 
 
@@ -33,7 +33,7 @@ def main() -> None:
     parser.add_argument("images", type=Path, nargs="*")
     parser.add_argument("--output", type=Path, default=darkeners.SHIPPED)
     parser.add_argument("--width", type=int, default=16)
-    parser.add_argument("--steps", type=int, default=1200)
+    parser.add_argument("--steps", type=int, default=500)
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     cli.use_compilation_cache()

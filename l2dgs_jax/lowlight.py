@@ -79,7 +79,7 @@ def uniform_darkener(sample: Float32[np.ndarray, " N"], exposure: float) -> Dark
     """
     wanted = exposure_map(sample, exposure).mean()
     excess = lambda r: float(_uniform_curve(sample, r).mean() - wanted)
-    r = brentq(excess, 0, 1) if excess(0) > 0 else 0.0
+    r = brentq(excess, 0.0, 1.0) if excess(0.0) > 0 else 0.0
     return lambda light, _: _uniform_curve(light, r)
 
 

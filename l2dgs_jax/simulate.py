@@ -1,4 +1,4 @@
-"""`python -m l2dgs_jax.simulate SCENE OUT`: a low-light twin of a well-lit scene, with the scene itself as its truth."""
+"""`python -m l2dgs_jax.simulate SCENE OUT`: a low-light twin of a scene, with the scene itself as its truth."""
 
 import dataclasses
 import json
@@ -55,7 +55,7 @@ class Simulate:
     method: Literal["network", "uniform"] = "network"
     weights: Path | None = None
     exposure: float | None = None
-    exposure_range: tuple[float, float] = (0.04, 0.08)
+    exposure_range: tuple[float, float] = (0.03, 0.08)
     per_image: bool = False
     photons: float | None = None
     read_noise: float = 2.0

@@ -17,7 +17,7 @@ from l2dgs_jax.networks import apply_conv, init_conv
 from l2dgs_jax.types import Conv
 
 ITERATIONS = 10  # of the curve
-EXPOSURE_WEIGHT, SPATIAL_WEIGHT, SMOOTHNESS_WEIGHT = 10.0, 1.0, 200.0
+EXPOSURE_WEIGHT, SPATIAL_WEIGHT, SMOOTHNESS_WEIGHT = 10.0, 1.0, 1000.0
 BLOCK = 4  # pixels that the spatial loss averages over, each way
 
 Scalar = Float[Array, ""]
