@@ -12,12 +12,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
-from scipy.optimize import brentq
 
 from l2dgs_jax import zerodce
 from l2dgs_jax.tone import linear_to_srgb, srgb_to_linear
 
 SATURATED = 0.97  # lightness from which a pixel shows a light source or clipped white
+HIGHLIGHT_POWER = 33  # of the analytic curve
 
 LabOrder = Literal["correct", "lednet"]
 Image = Float32[np.ndarray, "H W 3"]
@@ -31,7 +31,7 @@ def darken(image: Image, exposure: float, darkener: Darkener, order: LabOrder, b
     Args:
         image: sRGB values in [0, 1].
         exposure: mean lightness wanted of the dark twin, saturated pixels aside.
-        darkener: network or uniform curve.
+        darkener: analytic or network.
         order: see `lightness`.
         brighten: let pixels become brighter where the darkener says so, as LEDNet does; else no ratio exceeds 1.
     """
@@ -69,18 +69,20 @@ def network_darkener(net: zerodce.CurveNet) -> Darkener:
     return lambda light, exposure: np.asarray(compiled(jnp.asarray(light), jnp.asarray(exposure)))
 
 
-def uniform_darkener(sample: Float32[np.ndarray, " N"], exposure: float) -> Darkener:
-    """One curve parameter for all pixels and all iterations: a tone curve, which keeps the order of lightnesses.
+def analytic_darkener(sample: Float32[np.ndarray, " N"], exposure: float) -> Darkener:
+    """One tone curve for all pixels, y = s x + (1 - s) x^33: a scale s, from which only highlights depart towards 1.
+
+    It keeps the order of lightnesses, and nearly their ratios: a video that is darkened by one such curve does not
+    flicker as its content changes.
 
     Args:
-        sample: lightness of pixels of everything that the curve is for; the mean of their dark twins becomes that of
-            their exposure map, or their own if that is darker.
+        sample: lightness of pixels of everything that the curve is for; s brings the mean of those that are not
+            saturated to the exposure, and is 1 if they are darker than that.
         exposure: as for `darken`.
     """
-    wanted = exposure_map(sample, exposure).mean()
-    excess = lambda r: float(_uniform_curve(sample, r).mean() - wanted)
-    r = brentq(excess, 0.0, 1.0) if excess(0.0) > 0 else 0.0
-    return lambda light, _: _uniform_curve(light, r)
+    rest = sample[~saturated(sample)]
+    scale = np.float32(min(exposure / max(float(rest.mean(dtype=np.float64)), 1e-6), 1)) if rest.size else np.float32(1)
+    return lambda light, _: scale * light + (1 - scale) * light**HIGHLIGHT_POWER
 
 
 def add_sensor_noise(image: Image, seed: tuple[int, ...], photons: float, read_noise: float) -> Image:
@@ -100,8 +102,3 @@ def add_sensor_noise(image: Image, seed: tuple[int, ...], photons: float, read_n
 def truncate(image: Image) -> UInt8[np.ndarray, "H W 3"]:
     """Eight bits by truncation; values that rounding errors keep from a whole level count as that level."""
     return np.floor(255 * np.clip(image, 0, 1) + 1e-3).astype(np.uint8)
-
-
-def _uniform_curve(lightness: Float32[np.ndarray, "*B"], r: float) -> Float32[np.ndarray, "*B"]:
-    curves = jnp.full((*lightness.shape, zerodce.ITERATIONS), r, lightness.dtype)
-    return np.asarray(zerodce.iterate(jnp.asarray(lightness), curves))

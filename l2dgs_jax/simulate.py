@@ -24,7 +24,7 @@ from l2dgs_jax.files import new_folder
 SETTINGS = "simulate.json"
 CONTACT_SHEET = "contact_sheet.png"
 Bytes = UInt8[np.ndarray, "H W 3"]
-SAMPLE = 1_000_000  # pixels of a video that the uniform curve is fitted to
+SAMPLE = 1_000_000  # pixels of a video that the analytic curve is fitted to
 
 
 @dataclass(frozen=True)
@@ -37,8 +37,8 @@ class Simulate:
         scene: folder of the scene, in any known layout; its well-lit pictures if it has both kinds.
         output: new folder for the twin.
         downscale: whole factor by which images are smaller than full size.
-        method: curves by the network, which sees neighbourhoods, or one uniform curve for the whole video.
-        weights: of the network: an .npz that experiments.train_darkener wrote or LEDNet's ce_zerodce.pth; else our own.
+        method: one analytic curve for the whole video, or curves by a network, which sees every pixel's neighbourhood.
+        weights: of the network: LEDNet's ce_zerodce.pth or an .npz of experiments.train_darkener; else our own.
         exposure: mean lightness of the dark frames, saturated pixels aside; drawn from the range if not given.
         exposure_range: lowest and highest exposure to draw (LEDNet: 0.05 0.3).
         per_image: draw an exposure for every frame, which makes videos flicker, instead of one for all.
@@ -52,10 +52,10 @@ class Simulate:
     scene: tyro.conf.Positional[str]
     output: tyro.conf.Positional[Path]
     downscale: int = 1
-    method: Literal["network", "uniform"] = "network"
+    method: Literal["analytic", "network"] = "analytic"
     weights: Path | None = None
     exposure: float | None = None
-    exposure_range: tuple[float, float] = (0.03, 0.08)
+    exposure_range: tuple[float, float] = (0.05, 0.08)
     per_image: bool = False
     photons: float | None = None
     read_noise: float = 2.0
@@ -92,9 +92,10 @@ def simulate(arguments: Sequence[str]) -> None:
         content = {"settings": settings, "mean": summary, "frames": {k: v._asdict() for k, v in frames.items()}}
         (folder / SETTINGS).write_text(json.dumps(content, indent=2) + "\n")
         write_image(folder / CONTACT_SHEET, contact_sheet(dataset))
+    decibels = "some frames unchanged" if summary["psnr"] is None else f"PSNR(low, well) {summary['psnr']:.2f} dB"
     print(
         f"{dataset.name}: {len(frames)} frames, mean level {summary['welllit_level']:.3f} -> {summary['level']:.3f}, "
-        f"PSNR(low, well) {summary['psnr']:.2f} dB; wrote {options.output}, see {options.output / CONTACT_SHEET}"
+        f"{decibels}; wrote {options.output}, see {options.output / CONTACT_SHEET}"
     )
 
 
@@ -198,9 +199,9 @@ def _darkener(
         network = lowlight.network_darkener(darkeners.load(options.weights or darkeners.SHIPPED))
         return lambda _: network
     if options.per_image:
-        return lambda i: lowlight.uniform_darkener(light(i), exposures[i])
-    uniform = lowlight.uniform_darkener(sample, exposures[0])
-    return lambda _: uniform
+        return lambda i: lowlight.analytic_darkener(light(i), exposures[i])
+    analytic = lowlight.analytic_darkener(sample, exposures[0])
+    return lambda _: analytic
 
 
 def _twin(split: Split, dark: list[Bytes], welllit: list[Bytes]) -> Split:

@@ -66,20 +66,24 @@ def test_truncation_keeps_whole_levels_and_drops_the_rest():
 
 
 @pytest.mark.parametrize("exposure", [0.03, 0.1, 0.3])
-def test_uniform_curve_meets_the_exposure_and_keeps_the_order(exposure):
-    light = np.random.default_rng(0).uniform(0, 1, 5000).astype(np.float32)
-    darkener = lowlight.uniform_darkener(light, exposure)
-    wanted = lowlight.exposure_map(light, exposure)
-    np.testing.assert_allclose(darkener(light[None], wanted[None]).mean(), wanted.mean(), atol=1e-5)
-    ordered = np.sort(light)[None]
-    dark = darkener(ordered, ordered)
-    assert np.all(np.diff(dark) >= 0)
-    assert np.all(dark <= ordered)
+def test_analytic_curve_is_a_scale_that_keeps_highlights_and_order(exposure):
+    light = np.random.default_rng(0).uniform(0, 0.7, 5000).astype(np.float32)
+    clipped = np.concatenate([light, np.ones(2000, np.float32)])
+    darkener = lowlight.analytic_darkener(clipped, exposure)
+    dark = darkener(light[None], light[None])
+    np.testing.assert_allclose(dark.mean(), exposure, rtol=1e-3)
+    np.testing.assert_allclose((dark / light)[light < 0.6], exposure / light.mean(), rtol=1e-3)
+    ramp = np.linspace(0, 1, 1001, dtype=np.float32)[None]
+    ordered = darkener(ramp, ramp)
+    assert np.all(np.diff(ordered) > 0)
+    assert np.all(ordered <= ramp)
+    assert ordered[0, -1] == 1
 
 
-def test_uniform_curve_leaves_what_is_dark_already():
-    light = np.full((3, 4), 0.2, np.float32)
-    np.testing.assert_array_equal(lowlight.uniform_darkener(light.ravel(), 0.3)(light, light), light)
+@pytest.mark.parametrize("level", [0.2, 0.0, 1.0])
+def test_analytic_curve_leaves_what_is_dark_or_saturated(level):
+    light = np.full((3, 4), level, np.float32)
+    np.testing.assert_array_equal(lowlight.analytic_darkener(light.ravel(), 0.3)(light, light), light)
 
 
 def test_sensor_noise_has_the_moments_of_photons_and_read_out():
