@@ -24,6 +24,7 @@ from l2dgs_jax.files import new_folder
 SETTINGS = "simulate.json"
 CONTACT_SHEET = "contact_sheet.png"
 Bytes = UInt8[np.ndarray, "H W 3"]
+MOST = 1e9  # electrons
 SAMPLE = 1_000_000  # pixels of a video that the analytic curve is fitted to
 
 
@@ -151,15 +152,21 @@ def contact_sheet(dataset: Dataset, rows: int = 4) -> UInt8[np.ndarray, "H W 3"]
 
 
 def _check(options: Simulate) -> None:
-    """Refuse settings that make no sense before anything is read."""
+    """Refuse settings that make no sense before anything is read.
+
+    Raises:
+        UserError: there is one.
+    """
     low, high = options.exposure_range if options.exposure is None else (options.exposure,) * 2
     if not 0 < low <= high < 1:
         name = "--exposure-range" if options.exposure is None else "--exposure"
         raise UserError(f"{name}: is {low:g} ... {high:g}; expected mean lightnesses between 0 (black) and 1 (white)")
     if options.weights is not None and options.method != "network":
         raise UserError("--weights: go with --method network; expected that method, or no weights")
-    if options.photons is not None and not (options.photons > 0 and options.read_noise >= 0):
-        raise UserError("--photons and --read-noise: expected a positive number of electrons and no negative noise")
+    if options.photons is not None and not (0 < options.photons <= MOST and 0 <= options.read_noise <= MOST):
+        raise UserError(f"--photons and --read-noise: expected electrons, more than 0 and from 0, at most {MOST:g}")
+    if options.seed < 0:
+        raise UserError(f"--seed {options.seed}: expected a whole number from 0")
 
 
 def _sources(dataset: Dataset) -> Iterator[Float16[np.ndarray, "H W 3"]]:

@@ -137,6 +137,8 @@ def test_weights_of_the_release_and_brightening(scene, tmp_path):
         (["--exposure-range", "0.2", "1"], ["--exposure-range"]),
         (["--exposure", "0.7"], ["blobs", "0.700", "--exposure"]),
         (["--photons", "0"], ["--photons"]),
+        (["--photons", "inf"], ["--photons"]),
+        (["--seed", "-1"], ["--seed -1"]),
         (["--photons", "9", "--read-noise", "-1"], ["--read-noise"]),
         (["--weights", "some.npz"], ["--weights", "--method"]),
         (["--method", "network", "--weights", "nonsuch.pth"], ["nonsuch.pth"]),
