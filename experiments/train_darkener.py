@@ -1,4 +1,4 @@
-"""The curve network that `simulate` darkens with: `python -m experiments.train_darkener [IMAGES ...] [--output FILE]`.
+"""The network of `simulate --method network`: `python -m experiments.train_darkener [IMAGES ...] [--output FILE]`.
 
 Without images it trains on photographs that scikit-image brings along: astronaut (NASA, public domain), camera (CC0,
 Lav Varshney), chelsea (CC0, Stefan van der Walt), coffee (CC0, Rachel Michetti) and rocket (SpaceX, public domain).

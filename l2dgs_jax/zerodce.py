@@ -17,6 +17,7 @@ from l2dgs_jax.networks import apply_conv, init_conv
 from l2dgs_jax.types import Conv
 
 ITERATIONS = 10  # of the curve
+# With Zero-DCE's smoothness of 200 the network learns to even out local tone as it trains, and edges get halos.
 EXPOSURE_WEIGHT, SPATIAL_WEIGHT, SMOOTHNESS_WEIGHT = 10.0, 1.0, 1000.0
 BLOCK = 4  # pixels that the spatial loss averages over, each way
 
