@@ -106,16 +106,16 @@ def init_bafe(key: PRNGKeyArray, cfg: ModelConfig) -> BAFENet:
     """
     keys = jax.random.split(key, 4)
     norm = lambda channels: GroupNorm(jnp.ones(channels), jnp.zeros(channels))
-    out = _conv_init(keys[3], 1, 8, 2)
+    out = init_conv(keys[3], 1, 8, 2)
     if cfg.initial_exponents is not None:
         raw = jnp.array([_exponent_inverse(value) for value in cfg.initial_exponents], out.bias.dtype)
         out = Conv(jnp.zeros_like(out.weight), raw)
     return BAFENet(
-        conv1=_conv_init(keys[0], 5, 2, 8),
+        conv1=init_conv(keys[0], 5, 2, 8),
         norm1=norm(8),
-        conv2=_conv_init(keys[1], 3, 8, 16),
+        conv2=init_conv(keys[1], 3, 8, 16),
         norm2=norm(16),
-        conv3=_conv_init(keys[2], 3, 16, 8),
+        conv3=init_conv(keys[2], 3, 16, 8),
         norm3=norm(8),
         out=out,
     )
@@ -133,10 +133,10 @@ def apply_bafe(bafe: BAFENet, attenuation: Float[Array, "*B H W 2"]) -> Float[Ar
     """
     x = jnp.tanh(attenuation.reshape(-1, *attenuation.shape[-3:]))
     leaky = lambda y: jax.nn.leaky_relu(y, LEAK)
-    first = leaky(_group_norm(bafe.norm1, _conv(bafe.conv1, x), 2))
-    second = leaky(_group_norm(bafe.norm2, _conv(bafe.conv2, first), 4))
-    third = leaky(_group_norm(bafe.norm3, _conv(bafe.conv3, second), 2) + SKIP_GAIN * first)
-    exponents = EXPONENT_CENTRE + EXPONENT_REACH * jax.nn.soft_sign(_conv(bafe.out, third))
+    first = leaky(_group_norm(bafe.norm1, apply_conv(bafe.conv1, x), 2))
+    second = leaky(_group_norm(bafe.norm2, apply_conv(bafe.conv2, first), 4))
+    third = leaky(_group_norm(bafe.norm3, apply_conv(bafe.conv3, second), 2) + SKIP_GAIN * first)
+    exponents = EXPONENT_CENTRE + EXPONENT_REACH * jax.nn.soft_sign(apply_conv(bafe.out, third))
     return exponents.reshape(attenuation.shape)
 
 
@@ -154,13 +154,14 @@ def _affine(layer: Linear, x: Float[Array, "*B I"]) -> Float[Array, "*B O"]:
     return flat.reshape(*x.shape[:-1], -1)
 
 
-def _conv_init(key: PRNGKeyArray, size: int, inputs: int, outputs: int) -> Conv:
+def init_conv(key: PRNGKeyArray, size: int, inputs: int, outputs: int) -> Conv:
+    """A `size` x `size` convolution with a Xavier-uniform kernel and a zero bias."""
     weight = _xavier(key, (size, size, inputs, outputs), size * size * inputs, size * size * outputs)
     return Conv(weight, jnp.zeros(outputs))
 
 
-def _conv(layer: Conv, x: Float[Array, "B H W I"]) -> Float[Array, "B H W O"]:
-    """Convolution with zero padding that keeps the size."""
+def apply_conv(layer: Conv, x: Float[Array, "B H W I"]) -> Float[Array, "B H W O"]:
+    """Convolution with zero padding that keeps the size. Gradients flow to both arguments."""
     layout = ("NHWC", "HWIO", "NHWC")
     y = jax.lax.conv_general_dilated(x, layer.weight, (1, 1), "SAME", dimension_numbers=layout)
     return y + layer.bias[None, None, None]

@@ -29,9 +29,13 @@ ORDER = [
     "metrics",
     "losses",
     "optim",
+    "zerodce",
+    "lowlight",
     "density",
     "engine",
     "checkpoint",
+    "torch_pickle",
+    "darkeners",
     "runs",
     "cli",
     "visualize",
@@ -40,6 +44,7 @@ ORDER = [
     "train",
     "convert",
     "masks",
+    "simulate",
 ]
 PACKAGE = Path(l2dgs_jax.__file__).parent
 MODULES = [path for path in PACKAGE.rglob("*.py") if path != PACKAGE / "__init__.py"]

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, Float32, Shaped, UInt8
 
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.files import replacing
+from l2dgs_jax.tone import linear_to_srgb
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".exr", ".hdr", ".bmp")
 
@@ -55,7 +56,7 @@ def read_image_and_alpha(path: Path) -> tuple[Float32[np.ndarray, "H W 3"], Floa
     color = np.ascontiguousarray(pixels[..., channels])
     alpha = spec.alpha_channel
     return (
-        srgb_from_linear(color) if _is_linear(spec) else color,
+        linear_to_srgb(np.clip(color, 0, 1)) if _is_linear(spec) else color,
         None if alpha < 0 else np.ascontiguousarray(pixels[..., alpha : alpha + 1]),
     )
 
@@ -90,12 +91,6 @@ def write_image(path: Path, image: Shaped[np.ndarray, "H W *C"]) -> None:
 def to_bytes(image: Float[np.ndarray, "*shape"] | Bool[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape"]:
     """Values in [0, 1], clipped, as rounded 8-bit integers."""
     return np.round(np.clip(np.asarray(image, np.float32), 0, 1) * 255).astype(np.uint8)
-
-
-def srgb_from_linear(light: Float32[np.ndarray, "*shape"]) -> Float32[np.ndarray, "*shape"]:
-    """The sRGB values (IEC 61966-2-1) of linear light, clipped to [0, 1]."""
-    light = np.clip(light, 0, 1)
-    return np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** np.float32(1 / 2.4) - 0.055)
 
 
 def area_average(image: Float32[np.ndarray, "H W C"], factor: int) -> Float32[np.ndarray, "h w C"]:
