@@ -108,7 +108,7 @@ def pinhole_and_lens(camera: ModelCamera) -> tuple[Float64[np.ndarray, "3 3"], L
 
 
 def _root(folder: Path, names: list[str]) -> Path:
-    """The folder that the images' names are relative to: the first one, from `images` on, that holds the first image."""
+    """The folder that the images' names are relative to: `images` or another that holds the first one."""
     usual = folder / "images"
     for place in (usual, folder, *sorted(path for path in folder.iterdir() if path.is_dir())):
         if place.is_dir() and names[0] in by_name(place):
