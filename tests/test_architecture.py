@@ -41,6 +41,7 @@ ORDER = [
     "evaluate",
     "train",
     "simulate",
+    "convert",
 ]
 PACKAGE = Path(l2dgs_jax.__file__).parent
 MODULES = [path for path in PACKAGE.rglob("*.py") if path != PACKAGE / "__init__.py"]

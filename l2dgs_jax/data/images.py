@@ -1,5 +1,6 @@
 """Pictures as arrays: sRGB values in [0, 1], `[H W 3]`, read and written by OpenImageIO."""
 
+import os
 from contextlib import closing
 from pathlib import Path
 from typing import NamedTuple
@@ -51,9 +52,8 @@ def read_image_and_alpha(path: Path) -> tuple[Float32[np.ndarray, "H W 3"], Floa
     pixels = _upright(np.asarray(pixels, np.float32), _orientation(spec))
     if _is_float(spec) and not np.isfinite(pixels).all():
         raise UserError(f"{path}: holds NaN or infinite values; expected finite colours")
-    channels = [0, 1, 2] if pixels.shape[-1] >= 3 else [0, 0, 0]
-    color = np.ascontiguousarray(pixels[..., channels])
-    alpha = spec.alpha_channel
+    color = pixels[..., :3] if pixels.shape[-1] >= 3 else np.repeat(pixels[..., :1], 3, axis=-1)
+    color, alpha = np.ascontiguousarray(color), spec.alpha_channel
     return (
         srgb_from_linear(color) if _is_linear(spec) else color,
         None if alpha < 0 else np.ascontiguousarray(pixels[..., alpha : alpha + 1]),
@@ -104,52 +104,13 @@ def area_average(image: Float32[np.ndarray, "H W C"], factor: int) -> Float32[np
     Rows and columns that fill no block are cropped from the bottom and the right, so that dividing K by `factor`
     stays exact.
     """
-    height, width = image.shape[0] // factor, image.shape[1] // factor
-    blocks = image[: height * factor, : width * factor].reshape(height, factor, width, factor, -1)
-    return blocks.mean((1, 3))
-
-
-def undistort(
-    image: Float32[np.ndarray, "H W C"], K: Float[np.ndarray, "3 3"], distortion: Float[np.ndarray, "5"]
-) -> Float32[np.ndarray, "H W C"]:
-    """The picture that the pinhole camera `without_skew(K)` would have taken.
-
-    Pixels that the lens did not see repeat the nearest one that it did.
-
-    Args:
-        image: as taken through the lens.
-        K: intrinsics of `image`, skew included.
-        distortion: (k1, k2, p1, p2, k3) of the Brown-Conrady model in OpenCV's order.
-    """
-    if not distortion.any() and K[0, 1] == 0:
-        return image
-    height, width = image.shape[:2]
-    x = (np.arange(width) + 0.5 - K[0, 2])[None, :] / K[0, 0]
-    y = (np.arange(height) + 0.5 - K[1, 2])[:, None] / K[1, 1]
-    k1, k2, p1, p2, k3 = distortion
-    r2 = x**2 + y**2
-    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    lens_x = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x**2)
-    lens_y = y * radial + 2 * p2 * x * y + p1 * (r2 + 2 * y**2)
-    # cv2.remap counts pixel centres from 0.
-    columns = (K[0, 0] * lens_x + K[0, 1] * lens_y + K[0, 2] - 0.5).astype(np.float32)
-    rows = (K[1, 1] * lens_y + K[1, 2] - 0.5).astype(np.float32)
-    warped = cv2.remap(image, columns, rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-    return np.clip(warped.reshape(image.shape), 0, 1)  # cubic interpolation overshoots
-
-
-def scale_intrinsics(K: Float[np.ndarray, "3 3"], factor: int) -> Float[np.ndarray, "3 3"]:
-    """Intrinsics of a picture shrunk by `factor`; exact because pixel centres lie at +0.5."""
-    return K / np.array([[factor], [factor], [1]])
-
-
-def without_skew(K: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
-    """Intrinsics of the pictures that `undistort` returns."""
-    return np.where(np.arange(9).reshape(3, 3) == 1, 0.0, K)
+    height, width, channels = image.shape[0] // factor, image.shape[1] // factor, image.shape[2]
+    whole = image[: height * factor, : width * factor]
+    return cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA).reshape(height, width, channels)
 
 
 def _open(path: Path) -> oiio.ImageInput:
-    if not path.is_file():
+    if not os.path.isfile(path):
         raise UserError(f"{path}: no such file; expected a picture")
     # Without this hint OpenImageIO multiplies colours by alpha, and pixels of alpha 0 turn black.
     keep = oiio.ImageSpec()
