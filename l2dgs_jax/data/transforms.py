@@ -171,7 +171,7 @@ def _pictures(folder: Path, files: dict[str, Path], downscale: int) -> dict[str,
     root = folder / "images"
     inside = [name for name, file in files.items() if file.is_relative_to(root)]
     plain = {name: Picture(file, 1) for name, file in files.items()}
-    return plain | dict(zip(inside, copies(root, downscale, inside) if inside else (), strict=True))
+    return plain | dict(zip(inside, copies(folder, root, downscale, inside) if inside else (), strict=True))
 
 
 def _frame(name: str, path: Path, content: dict[str, Any], file: Path, time: float, picture: Picture) -> Frame:
