@@ -18,7 +18,7 @@ from l2dgs_jax.errors import UserError
 from l2dgs_jax.types import Camera
 
 PROPERTY = settings(
-    max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
+    max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
 )
 WIDTH, HEIGHT = 14, 10
 NAMES = st.text("ab7é_ 日.-", min_size=1, max_size=8).filter(lambda name: name.strip(" .") == name)

@@ -132,7 +132,7 @@ def base(tmp_path_factory):
 
 @pytest.mark.parametrize(("layout", "file"), CASES)
 def test_a_damaged_file_gives_a_sentence_or_a_scene(base, layout, file):
-    check(base, layout, file, 12)
+    check(base, layout, file, 8)
 
 
 @pytest.mark.slow
