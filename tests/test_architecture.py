@@ -33,9 +33,11 @@ ORDER = [
     "runs",
     "cli",
     "visualize",
+    "capture",
     "render",
     "evaluate",
     "train",
+    "prepare",
 ]
 PACKAGE = Path(l2dgs_jax.__file__).parent
 MODULES = [path for path in PACKAGE.rglob("*.py") if path != PACKAGE / "__init__.py"]
