@@ -1,6 +1,6 @@
 """How close the poses that `prepare` finds come to those that a Nerfies scene gives.
 
-    python experiments/compare_poses.py video SCENE clip.avi       # the scene's frames as a video, almost lossless
+    python experiments/compare_poses.py video SCENE clip.avi       # the frames as a video: .avi without loss, .mp4 with
     python -m l2dgs_jax.prepare clip.avi OUT                       # or the folder of frames instead of the video
     python experiments/compare_poses.py compare SCENE OUT
 
@@ -37,8 +37,8 @@ def main() -> None:
 
 def make_video(paths: list[Path], target: Path) -> None:
     first = cv2.imread(str(paths[0]))
-    writer = cv2.VideoWriter(str(target), cv2.VideoWriter_fourcc(*"MJPG"), FPS, first.shape[1::-1])
-    writer.set(cv2.VIDEOWRITER_PROP_QUALITY, 100)
+    codec = "FFV1" if target.suffix == ".avi" else "mp4v"
+    writer = cv2.VideoWriter(str(target), cv2.VideoWriter_fourcc(*codec), FPS, first.shape[1::-1])
     for path in paths:
         writer.write(cv2.imread(str(path)))
     writer.release()
