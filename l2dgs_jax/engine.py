@@ -32,10 +32,11 @@ MARGIN = 1.3  # of the pair buffer over what was last needed: every size is a co
 
 
 class Batch(NamedTuple):
-    """The views of one step; images are sRGB in [0, 1]."""
+    """The views of one step; images are sRGB in [0, 1], and nothing is learned where they are not `valid`."""
 
     cameras: Camera
     images: Float[Array, "*S V H W 3"]
+    valid: Bool[Array, "*S V H W"] | None = None
 
 
 class TrainState(NamedTuple):
@@ -121,11 +122,15 @@ def objective(
     cfg = config.loss
     start, steps = (config.coarse_steps, config.fine_steps) if moving else (0, config.coarse_steps)
     eta = losses.eta(state.step - start, steps, cfg) if cfg.eta_restarts else losses.eta(state.step, config.steps, cfg)
-    loss, terms = losses.total(output, batch.images, cfg, eta, exponent_target(config))
+    target, counted = batch.images, jnp.ones((), batch.images.dtype)
+    if batch.valid is not None:
+        target = jnp.where(batch.valid[..., None], target, jax.lax.stop_gradient(output.images.lowlight))
+        counted = jnp.maximum(batch.valid.mean(dtype=target.dtype), 1e-6)
+    loss, terms = losses.total(output, target, cfg, eta, exponent_target(config))
     if moving:
         smoothness, time_smoothness, time_l1 = hexplane.regularisers(params.hexplane)
         loss += cfg.plane_smoothness * smoothness + cfg.time_smoothness * time_smoothness + cfg.time_l1 * time_l1
-    mse = jnp.mean(jnp.square(output.images.lowlight - batch.images))
+    mse = jnp.mean(jnp.square(output.images.lowlight - target)) / counted
     report = StepReport(loss, terms, -10 * jnp.log10(mse), output.pairs, output.overflow, jnp.isfinite(loss))
     return loss, (report, output.radii)
 
@@ -135,7 +140,7 @@ def train_step(
     state: TrainState, batch: Batch, config: Config, *, moving: bool, pair_capacity: int
 ) -> tuple[TrainState, StepReport]:
     """One Adam step on one batch; a step that cannot be trusted leaves the state as it was and says so."""
-    batch = jax.tree.map(lambda x: x.astype(state.stats.seen.dtype), batch)
+    batch = jax.tree.map(lambda x: x if x.dtype == bool else x.astype(state.stats.seen.dtype), batch)
 
     def value_and_grad(params: SceneParams) -> tuple:
         probe = jnp.zeros((*batch.cameras.time.shape, state.scene.alive.shape[0], 2), batch.images.dtype)
@@ -170,7 +175,8 @@ def adam(params: SceneParams, rates: dict[str, optim.Schedule], config: Config) 
 
 def split_darkening(split: Split, config: Config) -> Darkening:
     """How the frames are darker than `config.loss.exposure_level`."""
-    return darkening(float(split.images.mean(dtype=np.float64)), config.loss.exposure_level)
+    counted = True if split.valid is None else split.valid[..., None]
+    return darkening(float(split.images.mean(dtype=np.float64, where=counted)), config.loss.exposure_level)
 
 
 def resolve(config: Config, split: Split) -> Config:
@@ -194,7 +200,8 @@ def initial_state(dataset: Dataset, config: Config) -> TrainState:
     reflectance = None
     if config.model.reflectance_init == "observed":
         law = split_darkening(train, config)
-        reflectance = (observed_colors(points, train.cameras, train.images) / law.gain) ** (1 / law.exponent)
+        observed = observed_colors(points, train.cameras, train.images, train.valid)
+        reflectance = (observed / law.gain) ** (1 / law.exponent)
     scene = initialise(
         jax.random.key(config.seed), points, dataset.colors, train.cameras, config.model, capacity, reflectance
     )
@@ -257,7 +264,8 @@ def first_capacity(split: Split, config: Config, scene: Scene) -> int:
 
 def load_batch(split: Split, indices: Int[np.ndarray, " V"]) -> Batch:
     """The views of `indices`."""
-    return Batch(Camera(*(x[indices] for x in split.cameras)), split.images[indices])
+    valid = None if split.valid is None else split.valid[indices]
+    return Batch(Camera(*(x[indices] for x in split.cameras)), split.images[indices], valid)
 
 
 def density_due(stage_step: int, config: Config) -> bool:

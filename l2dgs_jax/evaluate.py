@@ -1,5 +1,6 @@
 """`python -m l2dgs_jax.evaluate RUN`: how well the views of a run match the input and, where known, the truth."""
 
+import dataclasses
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,9 +9,10 @@ from typing import Any, Literal
 
 import numpy as np
 import tyro
-from jaxtyping import Bool, Float, Shaped
+from jaxtyping import Float, Shaped
 
 from l2dgs_jax import cli, metrics, runs
+from l2dgs_jax.data.dataset import Split
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.files import replacing
 from l2dgs_jax.metrics import RegionScore
@@ -51,7 +53,8 @@ def evaluate(run: Run, split_name: str = "test") -> dict:
     """Render every view of a split and compare it with the input and, where the scene has it, with the well-lit truth.
 
     PSNR (dB) and SSIM are means over the frames. A region's PSNR is that of its own pixels, its SSIM the mean of the
-    whole frame's SSIM map over them (as NSFF, arXiv 2011.13084); a frame counts where it shows the region.
+    whole frame's SSIM map over them (as NSFF, arXiv 2011.13084); a frame counts where it shows the region. Pixels that
+    are not valid are left out everywhere.
 
     Returns:
         What can be written as JSON:
@@ -59,19 +62,23 @@ def evaluate(run: Run, split_name: str = "test") -> dict:
         * "split", "stage", "step", "gaussians", "frames": what was scored;
         * "lowlight": "psnr" and "ssim" of the estimate of the dark input against that input, and with masks
           "lowlight_regions", the same for "dynamic" and "static", and "mask_area", the dynamic part of all pixels;
-        * with truth "welllit": for "overall" and, with masks, "dynamic" and "static" the "psnr" and "ssim" of the
+          where the scene says what the training views have seen, "covisible" in "lowlight_regions", as DyCheck
+          (arXiv 2210.13445) scores it;
+        * with truth "welllit": for "overall" and each of those regions the "psnr" and "ssim" of the
           well-lit image as rendered, and "psnr_gain" and "ssim_gain" after it was multiplied by "gain" and clipped to
           [0, 1]: the one factor for all frames that brings them closest to the truth in the least-squares sense;
         * with truth "dark_frame_gain": "gain", "psnr_gain" and "ssim_gain" of the dark input times its own best factor,
           which is what knowing the exposure alone would score.
 
     Raises:
-        UserError: the split has no views.
+        UserError: the split has no views, or they have no valid pixel.
     """
     split = choose_split(run, split_name)
+    if split.valid is not None and not split.valid.any():
+        raise UserError(f"{run.folder}: no pixel of its scene's {split_name} views is valid; expected some to score")
     lowlight, welllit = [], []
     for index, output in enumerate(views(run, split)):
-        lowlight.append(_compare(output.images.lowlight, split.images, split.masks, index))
+        lowlight.append(_compare(output.images.lowlight, split.images, split, index))
         if split.welllit is not None:
             welllit.append(np.asarray(output.images.welllit, np.float16))  # as compact as the data set's own images
 
@@ -84,12 +91,15 @@ def evaluate(run: Run, split_name: str = "test") -> dict:
         "frames": len(split.names),
         "lowlight": scores.pop("overall"),
     }
+    if split.masks is not None or split.covisible is not None:
+        result["lowlight_regions"] = scores
     if split.masks is not None:
-        result |= {"lowlight_regions": scores, "mask_area": float(split.masks.mean())}
+        result["mask_area"] = float(split.masks.mean())
     if split.welllit is not None:
-        plain, gained, gain = _with_gain(np.stack(welllit), split.welllit, split.masks)
+        plain, gained, gain = _with_gain(np.stack(welllit), split.welllit, split)
         result |= {"welllit": {region: plain[region] | gained[region] for region in plain}, "gain": gain}
-        _, gained, gain = _with_gain(split.images, split.welllit, None)
+        whole = dataclasses.replace(split, masks=None, covisible=None)
+        _, gained, gain = _with_gain(split.images, split.welllit, whole)
         result["dark_frame_gain"] = {"gain": gain} | gained["overall"]
     return result
 
@@ -118,12 +128,12 @@ def table(result: dict) -> str:
 def _with_gain(
     predictions: Float[np.ndarray, "F H W 3"],
     truths: Float[np.ndarray, "F H W 3"],
-    masks: Bool[np.ndarray, "F H W"] | None,
+    split: Split,
 ) -> tuple[dict, dict, float]:
     """Scores per region without and with the one best gain, and that gain."""
-    plain = [_compare(p, truths, masks, i) for i, p in enumerate(predictions)]
-    gain = metrics.gain([frame["overall"] for frame in plain])
-    gained = [_compare(gain * p.astype(np.float32), truths, masks, i) for i, p in enumerate(predictions)]
+    plain = [_compare(p, truths, split, i) for i, p in enumerate(predictions)]
+    gain = metrics.gain([frame["overall"] for frame in plain if frame])
+    gained = [_compare(gain * p.astype(np.float32), truths, split, i) for i, p in enumerate(predictions)]
     after = metrics.summarise(gained)
     renamed = {region: {f"{key}_gain": value for key, value in means.items()} for region, means in after.items()}
     return metrics.summarise(plain), renamed, gain
@@ -132,12 +142,13 @@ def _with_gain(
 def _compare(
     prediction: Shaped[Any, "H W 3"],
     truths: Float[np.ndarray, "F H W 3"],
-    masks: Bool[np.ndarray, "F H W"] | None,
+    split: Split,
     index: int,
 ) -> dict[str, RegionScore]:
-    """Score a prediction, clipped to [0, 1], of the frame `index`."""
+    """Score a prediction, clipped to [0, 1], of the frame `index`, in the regions that the split marks."""
     clipped = np.clip(np.asarray(prediction, np.float32), 0, 1)
-    return metrics.compare(clipped, truths[index].astype(np.float32), None if masks is None else masks[index])
+    masks = (None if x is None else x[index] for x in (split.masks, split.valid, split.covisible))
+    return metrics.compare(clipped, truths[index].astype(np.float32), *masks)
 
 
 if __name__ == "__main__":

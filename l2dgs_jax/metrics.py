@@ -12,6 +12,8 @@ from l2dgs_jax.native import apart
 
 RADIUS = 5  # of the 11x11 SSIM window
 SIGMA = 1.5  # pixels
+WINDOW = np.exp(-0.5 * (np.arange(-RADIUS, RADIUS + 1) / SIGMA) ** 2)
+WINDOW /= WINDOW.sum()
 C1, C2 = 0.01**2, 0.03**2  # for values in [0, 1]
 
 Border = Literal["zero", "mirror"]
@@ -35,26 +37,43 @@ class RegionScore(NamedTuple):
     product: float
 
 
-def compare(prediction: Image, truth: Image, dynamic: Mask | None = None) -> dict[str, RegionScore]:
+def compare(
+    prediction: Image,
+    truth: Image,
+    dynamic: Mask | None = None,
+    valid: Mask | None = None,
+    covisible: Mask | None = None,
+) -> dict[str, RegionScore]:
     """Score one frame, values in [0, 1].
 
     Args:
         prediction: rendered image.
         truth: what it should be.
         dynamic: which pixels show something that moves.
+        valid: which pixels count; None for all. "overall" is then scored as "covisible" is.
+        covisible: which pixels enough training views have seen.
 
     Returns:
-        The score of "overall" and, given a mask, of "dynamic" and "static", those of them that have any pixel.
+        The score of "overall", given `dynamic` of "dynamic" and "static", and given `covisible` of "covisible" as
+        DyCheck does (mPSNR, mSSIM), those of them that have any pixel.
     """
     prediction, truth = np.asarray(prediction), np.asarray(truth, prediction.dtype)
-    masks = {"overall": np.ones(prediction.shape[:2], bool)}
+    counted = np.ones(prediction.shape[:2], bool) if valid is None else np.asarray(valid)
+    truth = np.where(counted[..., None], truth, prediction)
+    masks = {"overall": counted}
     if dynamic is not None:
-        masks |= {"dynamic": np.asarray(dynamic), "static": ~np.asarray(dynamic)}
+        masks |= {"dynamic": counted & np.asarray(dynamic), "static": counted & ~np.asarray(dynamic)}
+    if covisible is not None:
+        masks["covisible"] = counted & np.asarray(covisible)
     scores = {}
     for region, mask in masks.items():
-        if region != "overall" and not mask.any():
+        if not mask.any():
             continue
-        similarity = _ssim(prediction, truth) if region == "overall" else _masked_ssim(prediction, truth, mask)
+        if region == "overall" and valid is None:
+            similarity = _ssim(prediction, truth)
+        else:
+            measure = _masked_ssim if region in ("dynamic", "static") else _partial_ssim
+            similarity = measure(prediction, truth, mask)
         p, t = prediction[mask].astype(np.float64), truth[mask].astype(np.float64)
         decibels = _psnr(prediction, truth, mask)
         scores[region] = RegionScore(float(decibels), float(similarity), float(np.sum(p * p)), float(np.sum(p * t)))
@@ -121,6 +140,37 @@ def masked_ssim(
     return _masked_mean(ssim_map(a, b, "mirror"), mask)
 
 
+def partial_ssim(a: Float[Array, "H W C"], b: Float[Array, "H W C"], mask: Bool[Array, "H W"]) -> Float[Array, ""]:
+    """Mean SSIM over the windows inside the image, of which each sees only its pixels in a mask: DyCheck's mSSIM.
+
+    Source: arXiv 2210.13445 and its code. Sums along a window's side are scaled by its length over the number of pixels
+    that it sees, whatever their weights; windows that see nothing count as equal. For an image without a window inside,
+    `masked_ssim`.
+    """
+    if min(a.shape[:2]) <= 2 * RADIUS:
+        return masked_ssim(a, b, mask)
+
+    def blur(images: Float[Array, "H W C"]) -> Float[Array, "h w C"]:
+        seen = jnp.asarray(mask, images.dtype)[..., None]
+        for axis in (1, 0):
+            shifted = lambda x, axis=axis: [
+                jax.lax.slice_in_dim(x, k, k + x.shape[axis] - 2 * RADIUS, axis=axis) for k in range(len(WINDOW))
+            ]
+            count = jnp.stack(shifted(seen)).sum(0)
+            total = sum(float(w) * x for w, x in zip(WINDOW, shifted(images * seen), strict=True))
+            images = jnp.where(count > 0, total * len(WINDOW) / jnp.maximum(count, 1), 0)
+            seen = jnp.asarray(count > 0, images.dtype)
+        return images
+
+    mean_a, mean_b, square_a, square_b, product = map(blur, (a, b, a * a, b * b, a * b))
+    var_a, var_b = jnp.maximum(square_a - mean_a**2, 0), jnp.maximum(square_b - mean_b**2, 0)
+    bound = jnp.sqrt(var_a * var_b)
+    covariance = jnp.clip(product - mean_a * mean_b, -bound, bound)
+    return (
+        ((2 * mean_a * mean_b + C1) * (2 * covariance + C2)) / ((mean_a**2 + mean_b**2 + C1) * (var_a + var_b + C2))
+    ).mean()
+
+
 def psnr(
     a: Float[Array, "*B H W C"], b: Float[Array, "*B H W C"], mask: Bool[Array, "*B H W"] | None = None
 ) -> Float[Array, "*B"]:
@@ -139,14 +189,11 @@ def _masked_mean(values: Float[Array, "*B H W C"], mask: Bool[Array, "*B H W"]) 
 
 def _window_mean(images: Float[Array, "*B H W C"]) -> Float[Array, "*B H W C"]:
     """The mean in a Gaussian window around each pixel, zeros beyond the image."""
-    offsets = np.arange(-RADIUS, RADIUS + 1)
-    window = np.exp(-0.5 * (offsets / SIGMA) ** 2)
-    window /= window.sum()
 
     def along(axis: int, x: Float[Array, "*B H W C"]) -> Float[Array, "*B H W C"]:
         padded = jnp.pad(x, [(RADIUS, RADIUS) if k == x.ndim + axis else (0, 0) for k in range(x.ndim)])
-        shifted = (jax.lax.slice_in_dim(padded, k, k + x.shape[axis], axis=axis) for k in range(len(window)))
-        return sum((float(weight) * image for weight, image in zip(window, shifted, strict=True)), jnp.zeros_like(x))
+        shifted = (jax.lax.slice_in_dim(padded, k, k + x.shape[axis], axis=axis) for k in range(len(WINDOW)))
+        return sum((float(weight) * image for weight, image in zip(WINDOW, shifted, strict=True)), jnp.zeros_like(x))
 
     return along(-2, along(-3, images))
 
@@ -156,4 +203,4 @@ _blur = jax.custom_vjp(apart(_window_mean))
 _blur.defvjp(lambda images: (_blur(images), None), lambda _, cotangent: (_blur(cotangent),))
 
 
-_ssim, _masked_ssim, _psnr = jax.jit(ssim), jax.jit(masked_ssim), jax.jit(psnr)
+_ssim, _masked_ssim, _partial_ssim, _psnr = jax.jit(ssim), jax.jit(masked_ssim), jax.jit(partial_ssim), jax.jit(psnr)

@@ -6,7 +6,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray, Shaped
+from jaxtyping import Array, Bool, Float, PRNGKeyArray, Shaped
 from scipy.spatial import cKDTree
 
 from l2dgs_jax import hexplane, networks
@@ -131,7 +131,10 @@ def _initialise(
 
 
 def observed_colors(
-    points: Float[np.ndarray, "P 3"], cameras: Camera, images: Float[np.ndarray, "F H W 3"]
+    points: Float[np.ndarray, "P 3"],
+    cameras: Camera,
+    images: Float[np.ndarray, "F H W 3"],
+    valid: Bool[np.ndarray, "F H W"] | None = None,
 ) -> Float[np.ndarray, "P 3"]:
     """Median colour of the pixels that each point projects to, occlusion ignored; the mean where none are.
 
@@ -139,6 +142,7 @@ def observed_colors(
         points: world units.
         cameras: F cameras.
         images: their images, sRGB in [0, 1].
+        valid: which pixels count; None for all.
     """
     height, width = images.shape[1:3]
     seen = np.full((len(images), len(points), 3), np.nan, np.float32)
@@ -147,9 +151,12 @@ def observed_colors(
         depth = np.where(z > 0, z, np.inf)
         column, row = np.floor(x / depth).astype(int), np.floor(y / depth).astype(int)
         inside = (z > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        if valid is not None:
+            inside[inside] = valid[frame, row[inside], column[inside]]
         seen[frame, inside] = image[row[inside], column[inside]]
     unseen = np.isnan(seen).all((0, 2))
-    seen[:, unseen] = images.mean((0, 1, 2), dtype=np.float64)
+    counted = True if valid is None else valid[..., None]
+    seen[:, unseen] = images.mean((0, 1, 2), dtype=np.float64, where=counted)
     return np.nanmedian(seen, axis=0)
 
 

@@ -44,7 +44,7 @@ def train(arguments: Sequence[str]) -> None:
     options = _parse(arguments)
     folder, config = options.output, options.config
     assert folder is not None
-    dataset = load(options.scene, config.downscale)
+    dataset = load(options.scene, config.downscale, config.format, config.held_out)
     config = engine.resolve(config, dataset.train)
     state, pair_capacity = engine.initial_state(dataset, config), None
     if options.resume:
@@ -52,6 +52,8 @@ def train(arguments: Sequence[str]) -> None:
     else:
         runs.write_settings(folder, options.scene, config)
 
+    for note in dataset.notes:
+        print(f"note: {note}")
     print(f"{dataset.name}: {len(dataset.train.names)} frames of {dataset.width}x{dataset.height}; run folder {folder}")
     start = int(state.step)
     try:

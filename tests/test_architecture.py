@@ -37,6 +37,7 @@ ORDER = [
     "render",
     "evaluate",
     "train",
+    "convert",
     "prepare",
 ]
 PACKAGE = Path(l2dgs_jax.__file__).parent

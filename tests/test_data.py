@@ -329,3 +329,66 @@ def test_demo_loads_and_is_small():
     assert "MIT License" in (demo.FOLDER / "LICENSE").read_text()
     pixels = pinhole_projection(dataset.train, 0, dataset.points)
     assert np.mean(np.all((pixels > 0) & (pixels < [128, 96]), -1)) > 0.3
+
+
+def test_pixels_of_alpha_0_do_not_count(tmp_path):
+    scene = write_nerfies(tmp_path)
+    pixels = np.full((24, 32, 4), 0.5)
+    pixels[:, 0, 3] = 0
+    write_image(scene / "rgb" / "1x" / "000003.png", pixels)
+    dataset = data.load(scene, 2)
+    third = dataset.train.names.index("000003")
+    assert dataset.test.valid is None
+    assert not dataset.train.valid[third, :, 0].any()  # half of each of these pixels is marked
+    assert dataset.train.valid.sum() == dataset.train.valid.size - 12
+    np.testing.assert_allclose(dataset.train.images[third].astype(float), 128 / 255, atol=1e-3)
+
+
+def test_covisible_masks(tmp_path):
+    scene = write_nerfies(tmp_path)
+    mask = np.zeros((12, 16))
+    mask[:, :6] = 1
+    for name in ("000002", "000006"):
+        write_image(scene / "covisible" / "2x" / "val" / f"{name}.png", mask)
+    dataset = data.load(scene, 2)
+    assert dataset.train.covisible is None
+    assert dataset.test.covisible.dtype == bool
+    np.testing.assert_array_equal(dataset.test.covisible, np.broadcast_to(mask > 0, (2, 12, 16)))
+
+
+def test_layouts_are_told_apart_and_can_be_named(tmp_path):
+    scene = write_nerfies(tmp_path / "scene", 9)
+    other = data.load(scene)
+    data.LAYOUTS["transforms"].write(other, tmp_path / "other")
+    for path in (tmp_path / "other").iterdir():
+        shutil.move(path, scene / path.name)
+    with pytest.raises(UserError, match="scene: holds the layouts nerfies and transforms; expected one, or --format"):
+        data.load(scene)
+    assert data.load(scene, format="nerfies").test.names == data.load(scene, format="transforms").test.names
+    for name, wanted in (("colmap", "sparse/0: no such model"), ("llff", "poses_bounds.npy: no such file")):
+        with pytest.raises(UserError, match=wanted):
+            data.load(scene, format=name)
+    with pytest.raises(UserError, match="--format nonsuch: no such layout; expected auto, nerfies"):
+        data.load(scene, format="nonsuch")
+
+
+def test_frames_to_hold_out_can_be_chosen(scene):
+    assert data.load(scene, held_out="4").test.names == ("000000", "000004")
+    with pytest.raises(UserError, match="--held-out 1: expected"):
+        data.load(scene, held_out="1")
+
+
+def test_a_zip_archive_is_named_as_such(scene):
+    shutil.make_archive(str(scene), "zip", scene)
+    with pytest.raises(UserError, match=r"scene\.zip: is a zip archive; expected a folder: unpack it first"):
+        data.load(f"{scene}.zip")
+
+
+def test_a_scene_beyond_single_precision_is_refused(scene):
+    np.save(scene / "points.npy", np.full((60, 3), 1e200))
+    with pytest.raises(UserError, match="scene: a point holds values beyond 1e18"):
+        data.load(scene)
+    np.save(scene / "points.npy", np.ones((60, 3)))
+    edit_json(scene / CAMERA, position=[0, 1e300, 0])
+    with pytest.raises(UserError, match=f"{CAMERA}: the camera holds values beyond"):
+        data.load(scene)

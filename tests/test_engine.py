@@ -138,6 +138,30 @@ def test_probe_gradient_is_the_gradient_of_moving_on_screen(dataset):
     np.testing.assert_allclose((ahead - behind) / 2e-6, jnp.vdot(slope, direction), rtol=2e-3)
 
 
+def test_nothing_is_learned_from_pixels_that_do_not_count(dataset):
+    config = tiny()
+    valid = np.random.default_rng(0).random((FRAMES, HEIGHT, WIDTH)) < 0.7
+    states = []
+    for wrong in (0.0, 1.0, None):
+        images = dataset.train.images if wrong is None else np.where(valid[..., None], dataset.train.images, wrong)
+        split = dataclasses.replace(
+            dataset.train, images=images.astype(np.float16), valid=np.ones_like(valid) if wrong is None else valid
+        )
+        masked = dataclasses.replace(dataset, train=split)
+        state = engine.initial_state(masked, config)
+        batch = engine.load_batch(split, np.array([1, 4]))
+        states.append(engine.train_step(state, batch, config, moving=False, pair_capacity=4096))
+    assert_equal_states(states[0], states[1])
+    assert states[2][1].loss != states[0][1].loss
+    state = engine.initial_state(dataset, config)
+    plain = jax.tree.map(lambda x: jnp.asarray(x, float), engine.load_batch(dataset.train, np.array([1, 4])))
+    probe = jnp.zeros((2, state.scene.alive.shape[0], 2))
+    without_mask = jax.jit(lambda p: engine.objective(p, probe, state, plain, config, False, 4096)[1][0])
+    report = without_mask(state.scene.params)
+    np.testing.assert_allclose(states[2][1].loss, report.loss, rtol=1e-6)
+    np.testing.assert_allclose(states[2][1].psnr, report.psnr, rtol=1e-6)
+
+
 def test_training_lowers_the_loss_and_grows(dataset):
     config = tiny(coarse_steps=40, fine_steps=0)
     reports = [

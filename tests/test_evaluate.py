@@ -213,3 +213,34 @@ def test_run_without_a_coarse_checkpoint(base, tmp_path, capsys):
         cli.main(main, [str(tmp_path / "young"), "--stage", "coarse"])
     assert leave.value.code == 2
     assert "coarse.npz: no such checkpoint; expected a run that has got that far" in capsys.readouterr().err
+
+
+def test_pixels_that_do_not_count_are_left_out_and_covisible_ones_scored(run, result, rendered):
+    split = run.dataset.test
+    rng = np.random.default_rng(0)
+    valid, seen = (rng.random(split.masks.shape) < share for share in (0.8, 0.5))
+    results = []
+    for wrong in (0, 1):
+        spoil = lambda images, wrong=wrong: np.where(valid[..., None], images, wrong).astype(np.float16)
+        test = dataclasses.replace(
+            split, images=spoil(split.images), welllit=spoil(split.welllit), valid=valid, covisible=seen
+        )
+        results.append(evaluate(dataclasses.replace(run, dataset=dataclasses.replace(run.dataset, test=test))))
+    assert results[0] == results[1]
+    found = results[0]
+    assert found["lowlight_regions"].keys() == {"dynamic", "static", "covisible"}
+    assert found["welllit"].keys() == {"overall", "dynamic", "static", "covisible"}
+    for region, masks in (("covisible", valid & seen), ("static", valid & ~split.masks)):
+        expected = psnr(rendered["lowlight"], rendered["input"], masks)
+        np.testing.assert_allclose(found["lowlight_regions"][region]["psnr"], expected, atol=1e-4)
+    np.testing.assert_allclose(
+        found["lowlight"]["psnr"], psnr(rendered["lowlight"], rendered["input"], valid), atol=1e-4
+    )
+    assert "covisible" in table(found)
+    assert "covisible" not in table(result)
+
+
+def test_a_split_in_which_no_pixel_counts_is_refused(run):
+    test = dataclasses.replace(run.dataset.test, valid=np.zeros(run.dataset.test.masks.shape, bool))
+    with pytest.raises(UserError, match="no pixel of its scene's test views is valid; expected"):
+        evaluate(dataclasses.replace(run, dataset=dataclasses.replace(run.dataset, test=test)))

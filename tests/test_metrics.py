@@ -188,3 +188,64 @@ def test_mixed_precision_frames_are_accepted():
     single = metrics.compare(jnp.asarray(prediction, jnp.float32), truth, jnp.asarray(mask))
     double = metrics.compare(prediction, truth, mask)
     np.testing.assert_allclose(single["dynamic"].psnr, double["dynamic"].psnr, atol=1e-4)
+
+
+def partial_ssim_by_windows(a, b, mask):
+    """DyCheck's mSSIM (arXiv 2210.13445), spelled out window by window."""
+    window = np.exp(-0.5 * (np.arange(-5, 6) / 1.5) ** 2)
+    window /= window.sum()
+
+    def along_a_line(values, seen):
+        return 11 * (window * values * seen).sum() / seen.sum() if seen.any() else 0.0
+
+    def mean(values):
+        rows, columns = values.shape
+        lines = np.array(
+            [
+                [along_a_line(values[i, j : j + 11], mask[i, j : j + 11]) for j in range(columns - 10)]
+                for i in range(rows)
+            ]
+        )
+        seen = np.array([[mask[i, j : j + 11].any() for j in range(columns - 10)] for i in range(rows)])
+        return np.array(
+            [
+                [along_a_line(lines[i : i + 11, j], seen[i : i + 11, j]) for j in range(columns - 10)]
+                for i in range(rows - 10)
+            ]
+        )
+
+    scores = []
+    for x, y in zip(np.moveaxis(a, -1, 0), np.moveaxis(b, -1, 0), strict=True):
+        ux, uy = mean(x), mean(y)
+        vx, vy = np.maximum(mean(x * x) - ux**2, 0), np.maximum(mean(y * y) - uy**2, 0)
+        cov = mean(x * y) - ux * uy
+        cov = np.sign(cov) * np.minimum(np.sqrt(vx * vy), np.abs(cov))
+        scores.append((2 * ux * uy + 1e-4) * (2 * cov + 9e-4) / ((ux**2 + uy**2 + 1e-4) * (vx + vy + 9e-4)))
+    return np.mean(scores)
+
+
+@pytest.mark.parametrize("share", [1.0, 0.7, 0.03])
+def test_partial_ssim_is_dychecks(share):
+    a, b = pair(11, 15, 17, 3)
+    mask = np.random.default_rng(0).random((15, 17)) < share
+    actual = metrics.partial_ssim(jnp.asarray(a), jnp.asarray(b), jnp.asarray(mask))
+    np.testing.assert_allclose(actual, partial_ssim_by_windows(a, b, mask), atol=1e-12)
+    if share == 1:
+        np.testing.assert_allclose(actual, ssim(jnp.asarray(a), jnp.asarray(b)), atol=1e-12)
+
+
+def test_pixels_that_do_not_count_change_no_score():
+    prediction, truth, moving = next(frames())
+    valid = np.random.default_rng(1).random(moving.shape) < 0.8
+    seen = np.random.default_rng(2).random(moving.shape) < 0.5
+    scores = metrics.compare(prediction, truth, moving, valid, seen)
+    assert scores.keys() == {"overall", "dynamic", "static", "covisible"}
+    other = np.where(valid[..., None], truth, 1 - truth)
+    assert metrics.compare(prediction, other, moving, valid, seen) == scores
+    for region, mask in (("overall", valid), ("dynamic", valid & moving), ("covisible", valid & seen)):
+        expected = peak_signal_noise_ratio(truth[mask], prediction[mask], data_range=1)
+        np.testing.assert_allclose(scores[region].psnr, expected, rtol=1e-12)
+    replaced = np.where(valid[..., None], truth, prediction)
+    for region, mask in (("overall", valid), ("covisible", valid & seen)):
+        np.testing.assert_allclose(scores[region].ssim, partial_ssim_by_windows(prediction, replaced, mask), atol=1e-12)
+    assert metrics.compare(prediction, truth, moving, np.zeros_like(valid), seen) == {}

@@ -1,5 +1,6 @@
 """`python -m l2dgs_jax.train` as a user meets it: a whole run, a killed one, and every mistake."""
 
+import dataclasses
 import json
 import os
 import signal
@@ -13,7 +14,9 @@ import pytest
 from scenes import edit_json, write_nerfies
 
 from l2dgs_jax import checkpoint, cli, engine, runs, train
+from l2dgs_jax.config import PRESETS
 from l2dgs_jax.data import load
+from l2dgs_jax.errors import UserError
 
 TINY = [
     "--coarse-steps=6",
@@ -194,3 +197,23 @@ def test_an_unknown_option_is_refused(capsys, scene):
         cli.main(train.train, [str(scene), "--nonsuch=1"])
     assert caught.value.code == 2
     assert "nonsuch" in capsys.readouterr().err
+
+
+def test_a_layout_that_the_scene_does_not_have(refuses, scene, tmp_path):
+    refuses(scene, "--format=llff", "--output", tmp_path / "run", naming=["poses_bounds.npy"])
+    refuses(scene, "--held-out=every", "--output", tmp_path / "run", naming=["--held-out every", "4dgs"])
+
+
+def test_layout_and_held_out_views_stay_those_of_the_run(scene, tmp_path, monkeypatch):
+    config = dataclasses.replace(PRESETS["demo"], format="nerfies", held_out="5", downscale=2)
+    runs.write_settings(tmp_path, str(scene), config)
+    assert train._parse([str(scene), "--output", str(tmp_path), "--resume"]).config == config
+
+    def stop(*arguments):
+        raise UserError(repr(arguments))
+
+    monkeypatch.setattr(runs, "load", stop)
+    (tmp_path / runs.CHECKPOINT).write_bytes(b"")
+    with pytest.raises(UserError) as caught:
+        runs.open_run(tmp_path)
+    assert str(caught.value) == repr((str(scene), 2, "nerfies", "5"))

@@ -1,32 +1,60 @@
-"""Scenes on disk to arrays in memory."""
+"""Scenes on disk to arrays in memory, and back."""
 
+import zipfile
 from pathlib import Path
+from types import ModuleType
 
-from l2dgs_jax.data import demo, nerfies
+import numpy as np
+
+from l2dgs_jax.data import colmap, demo, llff, nerfies, splits, transforms
 from l2dgs_jax.data.dataset import Dataset
 from l2dgs_jax.errors import UserError
 
-_READERS = (nerfies,)
+# Each has recognizes(folder), read(folder, downscale, held_out) and write(dataset, folder).
+LAYOUTS: dict[str, ModuleType] = {"nerfies": nerfies, "colmap": colmap, "transforms": transforms, "llff": llff}
 
 
-def load(scene: str | Path, downscale: int = 1) -> Dataset:
+def load(scene: str | Path, downscale: int = 1, format: str = "auto", held_out: str = "auto") -> Dataset:
     """Read a scene, whichever of the known layouts it has.
 
     Args:
         scene: its folder, or "demo" for the clip that comes with the package.
         downscale: whole factor by which images are smaller than full size.
+        format: a name in `LAYOUTS`, or "auto" for the one that the folder has.
+        held_out: which frames are not trained on, see `splits.choose`.
 
     Raises:
         UserError: anything in the scene is missing, malformed or inconsistent.
     """
     if downscale < 1:
         raise UserError(f"--downscale {downscale}: expected a whole number from 1")
+    splits.check_rule(held_out)
     folder = demo.FOLDER if scene == "demo" else Path(scene)
+    if folder.is_file() and zipfile.is_zipfile(folder):
+        raise UserError(f"{folder}: is a zip archive; expected a folder: unpack it first")
     if not folder.is_dir():
         raise UserError(f"{folder}: no such folder; expected a scene's folder, or 'demo'")
-    for reader in _READERS:
-        if reader.recognizes(folder):
-            return reader.read(folder, downscale)
+    if format == "auto":
+        format = _recognized(folder)
+    elif format not in LAYOUTS:
+        raise UserError(f"--format {format}: no such layout; expected auto, {', '.join(LAYOUTS)}")
+    try:
+        with np.errstate(all="ignore"):  # `assemble` complains of what has overflown
+            return LAYOUTS[format].read(folder, downscale, held_out)
+    except OSError as error:
+        raise UserError(f"{error.filename or folder}: {error.strerror}; expected files that can be read") from None
+
+
+def _recognized(folder: Path) -> str:
+    """The one layout that the folder has."""
     if not any(folder.iterdir()):
         raise UserError(f"{folder}: the folder is empty; expected a scene")
-    raise UserError(f"{folder}: not a known layout; expected camera/ and rgb/ as Nerfies and HyperNeRF have them")
+    found = [name for name, layout in LAYOUTS.items() if layout.recognizes(folder)]
+    if not found:
+        raise UserError(
+            f"{folder}: not a known layout; expected camera/ and rgb/ (Nerfies, HyperNeRF, DyCheck), sparse/ (COLMAP), "
+            "transforms.json (nerfstudio, D-NeRF, Blender), or poses_bounds.npy (LLFF)"
+        )
+    if len(found) > 1:
+        raise UserError(f"{folder}: holds the layouts {' and '.join(found)}; expected one, or --format with its name")
+    return found[0]

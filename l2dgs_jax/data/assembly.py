@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Float16, Float32
 
 from l2dgs_jax.data import images
 from l2dgs_jax.data.dataset import Dataset, Split
+from l2dgs_jax.data.lens import Lens, scale_intrinsics, undistort, without_skew
 from l2dgs_jax.data.pictures import Picture, stored_if_any
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.types import Camera
@@ -28,10 +29,10 @@ class Frame:
 
     Attributes:
         name: of the frame.
-        source: the file that describes its camera, for messages.
+        source: what describes its camera, for messages.
         viewmat: world to camera, rigid.
         K: intrinsics in pixels of the full size.
-        distortion: (k1, k2, p1, p2, k3), see `images.undistort`.
+        lens: its distortion.
         size: full width and height in pixels.
         time: instant in [0, 1].
         image: the low-light picture.
@@ -40,10 +41,10 @@ class Frame:
     """
 
     name: str
-    source: Path
+    source: str
     viewmat: Float[np.ndarray, "4 4"]
     K: Float[np.ndarray, "3 3"]
-    distortion: Float[np.ndarray, "5"]
+    lens: Lens
     size: tuple[int, int]
     time: float
     image: Picture
@@ -125,7 +126,7 @@ def _read_split(folder: Path, part: str, frames: Sequence[Frame], width: int, he
     names = [frame.name for frame in frames]
 
     def fit(frame: Frame, scale: int, image: Float32[np.ndarray, "h w C"]) -> Float32[np.ndarray, "H W C"]:
-        straight = images.undistort(image, images.scale_intrinsics(frame.K, scale), frame.distortion)
+        straight = undistort(image, scale_intrinsics(frame.K, scale), frame.lens)
         return images.area_average(straight, downscale // scale)[:height, :width]
 
     def read_all(root: Path, prefix: str = "") -> Float16[np.ndarray, "F H W 3"] | None:
@@ -153,7 +154,7 @@ def _read_split(folder: Path, part: str, frames: Sequence[Frame], width: int, he
         return fit(frame, frame.image.scale, image)
 
     lowlight = _filled(read_frame, (len(frames), height, width, 3))
-    K = [images.scale_intrinsics(images.without_skew(frame.K), downscale) for frame in frames]
+    K = [scale_intrinsics(without_skew(frame.K), downscale) for frame in frames]
     return Split(
         names=tuple(names),
         cameras=Camera(

@@ -1,10 +1,10 @@
 """Pictures as arrays: sRGB values in [0, 1], `[H W 3]`, read and written by OpenImageIO."""
 
+import os
 from contextlib import closing
 from pathlib import Path
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 import OpenImageIO as oiio  # noqa: N813
 from jaxtyping import Bool, Float, Float32, Shaped, UInt8
@@ -109,47 +109,8 @@ def area_average(image: Float32[np.ndarray, "H W C"], factor: int) -> Float32[np
     return blocks.mean((1, 3))
 
 
-def undistort(
-    image: Float32[np.ndarray, "H W C"], K: Float[np.ndarray, "3 3"], distortion: Float[np.ndarray, "5"]
-) -> Float32[np.ndarray, "H W C"]:
-    """The picture that the pinhole camera `without_skew(K)` would have taken.
-
-    Pixels that the lens did not see repeat the nearest one that it did.
-
-    Args:
-        image: as taken through the lens.
-        K: intrinsics of `image`, skew included.
-        distortion: (k1, k2, p1, p2, k3) of the Brown-Conrady model in OpenCV's order.
-    """
-    if not distortion.any() and K[0, 1] == 0:
-        return image
-    height, width = image.shape[:2]
-    x = (np.arange(width) + 0.5 - K[0, 2])[None, :] / K[0, 0]
-    y = (np.arange(height) + 0.5 - K[1, 2])[:, None] / K[1, 1]
-    k1, k2, p1, p2, k3 = distortion
-    r2 = x**2 + y**2
-    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    lens_x = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x**2)
-    lens_y = y * radial + 2 * p2 * x * y + p1 * (r2 + 2 * y**2)
-    # cv2.remap counts pixel centres from 0.
-    columns = (K[0, 0] * lens_x + K[0, 1] * lens_y + K[0, 2] - 0.5).astype(np.float32)
-    rows = (K[1, 1] * lens_y + K[1, 2] - 0.5).astype(np.float32)
-    warped = cv2.remap(image, columns, rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-    return np.clip(warped.reshape(image.shape), 0, 1)  # cubic interpolation overshoots
-
-
-def scale_intrinsics(K: Float[np.ndarray, "3 3"], factor: int) -> Float[np.ndarray, "3 3"]:
-    """Intrinsics of a picture shrunk by `factor`; exact because pixel centres lie at +0.5."""
-    return K / np.array([[factor], [factor], [1]])
-
-
-def without_skew(K: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
-    """Intrinsics of the pictures that `undistort` returns."""
-    return np.where(np.arange(9).reshape(3, 3) == 1, 0.0, K)
-
-
 def _open(path: Path) -> oiio.ImageInput:
-    if not path.is_file():
+    if not os.path.isfile(path):
         raise UserError(f"{path}: no such file; expected a picture")
     # Without this hint OpenImageIO multiplies colours by alpha, and pixels of alpha 0 turn black.
     keep = oiio.ImageSpec()

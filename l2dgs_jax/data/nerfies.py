@@ -13,9 +13,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32, Float64
 
+from l2dgs_jax.data import splits
 from l2dgs_jax.data.assembly import Frame, assemble
 from l2dgs_jax.data.dataset import Dataset
-from l2dgs_jax.data.parsing import name_list, numbers, read_array, read_json, value
+from l2dgs_jax.data.lens import Lens
+from l2dgs_jax.data.parsing import numbers, read_array, read_json, rotation
 from l2dgs_jax.data.pictures import Picture, stored
 from l2dgs_jax.data.writing import write_json, write_lists, write_pictures
 from l2dgs_jax.errors import UserError
@@ -27,17 +29,20 @@ def recognizes(folder: Path) -> bool:
     return (folder / "camera").is_dir()
 
 
-def read(folder: Path, downscale: int) -> Dataset:
+def read(folder: Path, downscale: int, held_out: str) -> Dataset:
     """Read a scene. World units are those of the scene file: X' = (X - center) * scale.
 
     Args:
         folder: of the scene.
         downscale: factor on the full size of the images.
+        held_out: see `splits.choose`.
 
     Raises:
         UserError: a file is missing, malformed or inconsistent.
     """
-    train, val, times = _split(folder)
+    listed, own = splits.lists(folder)
+    train, val = splits.choose(f"{folder / 'dataset.json'}", listed, own, held_out, default="4dgs")
+    times = splits.instants(folder, listed)
     center, scale = _normalization(folder)
     points, colors = _points(folder)
 
@@ -50,46 +55,6 @@ def read(folder: Path, downscale: int) -> Dataset:
 
     world = (points - center) * scale
     return assemble(folder, frames(train), frames(val), world, colors, downscale)
-
-
-def _split(folder: Path) -> tuple[list[str], list[str], dict[str, float]]:
-    """Identifiers of the training and the held-out frames, and the instant of every listed frame."""
-    path = folder / "dataset.json"
-    has_splits = (folder / "splits").is_dir()
-    content = {} if has_splits and not path.exists() else read_json(path, "the lists of frames")
-    if has_splits and not {"ids", "train_ids"} & content.keys():
-        path = folder / "splits" / "val.json"
-        train, val = (
-            name_list(file, read_json(file, "a list of frames"), "frame_names")
-            for file in (path.with_name("train.json"), path)
-        )
-        ids: list[str] = []
-    else:
-        ids = name_list(path, content, "ids") if "ids" in content else []
-        train = name_list(path, content, "train_ids") if "train_ids" in content or not ids else []
-        val = name_list(path, content, "val_ids") if "val_ids" in content else []
-    listed = ids if set(train + val) <= set(ids) else sorted({*train, *val})
-    if not val:
-        # The rule of 4DGS (arXiv 2310.08528) for clips of one camera: train on every fourth frame, score halfway.
-        train, val = listed[::4], listed[2::4][: (len(listed) - 1) // 4]
-    if len(train) < 2 or not val:
-        raise UserError(
-            f"{path}: {len(train)} frames to train with and {len(val)} held out, of {len(listed)} listed; expected at "
-            "least 2 and 1, or 5 in all if none is marked as held out"
-        )
-    return train, val, _times(folder / "metadata.json", listed)
-
-
-def _times(path: Path, names: list[str]) -> dict[str, float]:
-    """Instants in [0, 1]: `time` as it is, else warp_id or time_id spread over [0, 1], else the order of the frames."""
-    metadata = read_json(path, "the frames' instants") if path.exists() else {}
-    entries = [value(path, metadata, name, dict) for name in names] if metadata else []
-    key = next((key for key in ("time", "warp_id", "time_id") if any(key in entry for entry in entries)), None)
-    moments = np.array([numbers(path, entry, key, ()) for entry in entries] if key else range(len(names)), float)
-    if key == "time" and moments.min() >= 0 and moments.max() <= 1:
-        return dict(zip(names, moments.tolist(), strict=True))
-    span = np.ptp(moments) or 1.0
-    return dict(zip(names, ((moments - moments.min()) / span).tolist(), strict=True))
 
 
 def _normalization(folder: Path) -> tuple[Float64[np.ndarray, "3"], float]:
@@ -135,12 +100,10 @@ def _frame(
     optional = {"skew": 0.0, "pixel_aspect_ratio": 1.0, "radial_distortion": [0.0] * 3, tangential: [0.0] * 2}
     content = optional | content
 
-    rotation = numbers(path, content, "orientation", (3, 3))
-    if not (np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) and np.linalg.det(rotation) > 0):
-        raise UserError(f"{path}: 'orientation' is no rotation; expected an orthonormal matrix of determinant 1")
+    turned = rotation(f"{path}: 'orientation'", numbers(path, content, "orientation", (3, 3)))
     position = (numbers(path, content, "position", (3,)) - center) * scale
     viewmat = np.eye(4)
-    viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ position
+    viewmat[:3, :3], viewmat[:3, 3] = turned, -turned @ position
 
     focal, aspect = (float(numbers(path, content, key, ())) for key in ("focal_length", "pixel_aspect_ratio"))
     if focal <= 0 or aspect <= 0:
@@ -149,16 +112,17 @@ def _frame(
         )
     skew = float(numbers(path, content, "skew", ()))
     u, v = numbers(path, content, "principal_point", (2,))
-    k1, k2, k3 = numbers(path, content, "radial_distortion", (3,))
+    k1, k2, k3 = numbers(path, content, "radial_distortion", (3,)).tolist()
+    p1, p2 = numbers(path, content, tangential, (2,)).tolist()
     width, height = numbers(path, content, "image_size", (2,))
     if min(width, height) < 1 or width % 1 or height % 1:
         raise UserError(f"{path}: 'image_size' is {width} by {height}; expected whole positive numbers of pixels")
     return Frame(
         name=name,
-        source=path,
+        source=str(path),
         viewmat=viewmat,
         K=np.array([[focal, skew, u], [0, focal * aspect, v], [0, 0, 1]]),
-        distortion=np.array([k1, k2, *numbers(path, content, tangential, (2,)), k3]),
+        lens=Lens((k1, k2, k3), tangential=(p1, p2)),
         size=(int(width), int(height)),
         time=time,
         image=image,

@@ -1,6 +1,7 @@
 """Values from JSON and NumPy files, or one sentence on what is wrong with them."""
 
 import json
+import os
 import reprlib
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ def read_json(path: Path, what: str) -> dict[str, Any]:
     Raises:
         UserError: the file is missing, no JSON, or holds something else.
     """
-    if not path.is_file():
+    if not os.path.isfile(path):
         raise UserError(f"{path}: no such file; expected {what}")
     try:
         content = json.loads(path.read_bytes())
@@ -36,7 +37,7 @@ def read_array(path: Path, what: str) -> np.ndarray:
     Raises:
         UserError: the file is missing, damaged, or holds something else.
     """
-    if not path.is_file():
+    if not os.path.isfile(path):
         raise UserError(f"{path}: no such file; expected {what}")
     try:
         values = np.load(path, allow_pickle=False)
@@ -88,3 +89,16 @@ def numbers(path: Path, content: dict[str, Any], key: str, shape: tuple[int, ...
     if values.shape != shape or not np.isfinite(values).all():
         raise UserError(f"{path}: '{key}' is {reprlib.repr(content[key])}; expected {wanted}, finite")
     return values
+
+
+def rotation(what: str, matrix: Float64[np.ndarray, "3 3"]) -> Float64[np.ndarray, "3 3"]:
+    """The matrix, once it is found to be a rotation to about a thousandth; `what` names it.
+
+    Raises:
+        UserError: it is none.
+    """
+    with np.errstate(all="ignore"):
+        close = np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-3)
+    if not (close and np.linalg.det(matrix) > 0):
+        raise UserError(f"{what} is no rotation; expected an orthonormal matrix of determinant 1")
+    return matrix

@@ -43,6 +43,25 @@ def stored_if_any(root: Path, downscale: int, names: Sequence[str]) -> list[Pict
     return stored(root, downscale, names)
 
 
+def copies(root: Path, downscale: int, names: Sequence[str]) -> list[Picture]:
+    """Each frame's picture in `root`, or in `<root>_<k>` beside it for the largest such k that divides `downscale`.
+
+    Raises:
+        UserError: pictures of frames are missing.
+    """
+    factors = [k for k in range(downscale, 1, -1) if downscale % k == 0]
+    scale = next((k for k in factors if root.with_name(f"{root.name}_{k}").is_dir()), 1)
+    folder = root if scale == 1 else root.with_name(f"{root.name}_{scale}")
+    files = by_name(folder)
+    missing = [name for name in names if name not in files]
+    if missing:
+        raise UserError(
+            f"{folder}: holds {len(files)} pictures, but none of {len(missing)} of the {len(names)} frames, such as "
+            f"'{missing[0]}'; expected every frame's"
+        )
+    return [Picture(files[name], scale) for name in names]
+
+
 def by_name(folder: Path) -> dict[str, Path]:
     """Picture files by their path within the folder, without the suffix."""
     files = (path for path in sorted(folder.rglob("*")) if path.suffix.lower() in SUFFIXES)

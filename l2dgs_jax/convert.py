@@ -1,0 +1,49 @@
+"""`python -m l2dgs_jax.convert SCENE OUT --to LAYOUT`: a scene in another program's layout."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from l2dgs_jax import cli
+from l2dgs_jax.data import LAYOUTS, load
+
+
+@dataclass(frozen=True)
+class Convert:
+    """Write a scene in another layout; distortion is removed on the way, and pictures get 8 bits.
+
+    Attributes:
+        scene: folder of the scene, or "demo" for the clip that comes with the package.
+        output: folder to make.
+        to: layout to write.
+        format: layout of the scene's folder; found from its contents if not given.
+        downscale: whole factor by which to shrink the pictures.
+        held_out: views to mark as held out: the scene's own ("auto"), "4dgs", or k for every k-th.
+    """
+
+    scene: tyro.conf.Positional[str]
+    output: tyro.conf.Positional[Path]
+    to: Literal["nerfies", "colmap", "transforms", "llff"]
+    format: Literal["auto", "nerfies", "colmap", "transforms", "llff"] = "auto"
+    downscale: int = 1
+    held_out: str = "auto"
+
+
+def convert(arguments: Sequence[str]) -> None:
+    """Convert as the command line says."""
+    options = cli.parse(Convert, arguments, "convert")
+    dataset = load(options.scene, options.downscale, options.format, options.held_out)
+    for note in dataset.notes:
+        print(f"note: {note}")
+    LAYOUTS[options.to].write(dataset, options.output)
+    count = len(dataset.train.names) + len(dataset.test.names)
+    print(
+        f"wrote {count} frames of {dataset.width}x{dataset.height} and {len(dataset.points)} points to {options.output}"
+    )
+
+
+if __name__ == "__main__":
+    cli.main(convert)

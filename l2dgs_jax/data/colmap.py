@@ -1,0 +1,117 @@
+"""The layout of COLMAP and 3D Gaussian Splatting: a sparse model beside the pictures that it was made from.
+
+    sparse/0/{cameras,images,points3D}.{bin,txt}, or the same in sparse/
+    images/<name>, or the pictures in another folder or beside sparse/   [images_<k>/<name>, k times smaller]
+    [dataset.json]   [metadata.json]   as Nerfies has them: held-out frames and instants
+
+Alpha 0 marks pixels that do not count.
+"""
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+
+from l2dgs_jax.data import colmap_model, splits
+from l2dgs_jax.data.assembly import Frame, assemble
+from l2dgs_jax.data.colmap_model import ModelCamera, ModelImage
+from l2dgs_jax.data.dataset import Dataset
+from l2dgs_jax.data.lens import Lens
+from l2dgs_jax.data.pictures import by_name, copies
+from l2dgs_jax.data.writing import write_lists, write_pictures
+from l2dgs_jax.errors import UserError
+from l2dgs_jax.files import new_folder
+
+
+def recognizes(folder: Path) -> bool:
+    """Whether the folder has this layout."""
+    return colmap_model.find(folder) is not None
+
+
+def read(folder: Path, downscale: int, held_out: str) -> Dataset:
+    """Read a scene; its world is the model's.
+
+    Args:
+        folder: of the scene.
+        downscale: factor on the full size of the images.
+        held_out: see `splits.choose`; without lists every eighth frame is held out.
+
+    Raises:
+        UserError: a file is missing, malformed or inconsistent.
+    """
+    place = colmap_model.find(folder)
+    if place is None:
+        raise UserError(f"{folder / 'sparse' / '0'}: no such model; expected COLMAP's cameras, images and points3D")
+    cameras, images = colmap_model.read_cameras(place), colmap_model.read_images(place)
+    points, colors = colmap_model.read_points(place)
+
+    by_stem = {Path(image.name).with_suffix("").as_posix() if image.name else "": image for image in images}
+    if len(by_stem) < len(images):
+        raise UserError(f"{place}: images of one name but different suffixes; expected names that differ before it")
+    names = list(by_stem)
+    train, test = splits.choose(str(place), names, splits.lists_beside(folder, names), held_out, default="8")
+    times = splits.instants(folder, names)
+    root = _root(folder, names)
+
+    def frames(chosen: list[str]) -> list[Frame]:
+        described = []
+        for name, picture in zip(chosen, copies(root, downscale, chosen), strict=True):
+            image = by_stem[name]
+            if image.camera not in cameras:
+                raise UserError(f"{place}: '{image.name}' has camera {image.camera}; expected one that the model lists")
+            camera = cameras[image.camera]
+            K, lens = pinhole_and_lens(camera)
+            if not (K[0, 0] > 0 and K[1, 1] > 0):
+                raise UserError(f"{place}: camera {image.camera} has no positive focal length; expected one")
+            source, size = f"{place}, camera {image.camera}", (camera.width, camera.height)
+            described.append(Frame(name, source, image.viewmat, K, lens, size, times[name], picture))
+        return described
+
+    others = sorted(path.name for path in (folder / "sparse").iterdir() if path.is_dir() and path != place)
+    notes = (f"{place} is used; sparse/ also holds the models {', '.join(others)}",) if others else ()
+    return assemble(folder, frames(train), frames(test), points, colors, downscale, notes)
+
+
+def write(dataset: Dataset, folder: Path) -> None:
+    """Write a scene so that `read` gives it back, but for single precision in its rotations; pictures get 8 bits.
+
+    Raises:
+        UserError: the folder holds files already or cannot be written.
+    """
+    cameras: dict[ModelCamera, int] = {}
+    images = []
+    for split in (dataset.train, dataset.test):
+        for name, viewmat, K in zip(split.names, split.cameras.viewmat, split.cameras.K, strict=True):
+            params = tuple(float(K[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
+            camera = ModelCamera("PINHOLE", dataset.width, dataset.height, params)
+            number = cameras.setdefault(camera, len(cameras) + 1)
+            images.append(ModelImage(f"{name}.png", np.asarray(viewmat, np.float64), number))
+    with new_folder(folder) as place:
+        write_pictures(dataset, place / "images", place)
+        write_lists(dataset, place)
+        colmap_model.write_model(place / "sparse" / "0", list(cameras), images, dataset.points, dataset.colors)
+
+
+def pinhole_and_lens(camera: ModelCamera) -> tuple[Float64[np.ndarray, "3 3"], Lens]:
+    """Intrinsics and distortion of any camera model in `colmap_model.MODELS`."""
+    params = list(camera.params)
+    single = camera.model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
+    fx, fy, cx, cy, *rest = [params[0], *params] if single else params
+    match camera.model, rest:
+        case "OPENCV", (k1, k2, p1, p2):
+            lens = Lens((k1, k2), tangential=(p1, p2))
+        case "FULL_OPENCV", (k1, k2, p1, p2, k3, *divisor):
+            lens = Lens((k1, k2, k3), tuple(divisor), (p1, p2))
+        case _:  # the others have radial terms only, in order
+            lens = Lens(tuple(rest), fisheye=camera.model.endswith("FISHEYE"))
+    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), lens
+
+
+def _root(folder: Path, names: list[str]) -> Path:
+    """The folder that the images' names are relative to: `images`, else the first one that holds the first image."""
+    if (folder / "images").is_dir():
+        return folder / "images"
+    for place in (folder, *sorted(path for path in folder.iterdir() if path.is_dir())):
+        if names[0] in by_name(place):
+            return place
+    raise UserError(f"{folder / 'images'}: no such folder; expected the pictures that the model was made from")

@@ -1,0 +1,113 @@
+"""How lenses depart from the pinhole, and pictures without that."""
+
+import functools
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Float32
+
+
+class Lens(NamedTuple):
+    """A distortion in normalised image coordinates; the default is the pinhole.
+
+    Attributes:
+        radial: (k1, k2 ...) of 1 + k1 s + k2 s^2 ..., the factor on the radius; s is the squared radius r^2 or, for a
+            fisheye, the squared angle theta^2 to the axis.
+        divisor: (k4, k5, k6) of such a polynomial that the factor is divided by, as in OpenCV's rational model.
+        tangential: (p1, p2) of the Brown-Conrady model.
+        fisheye: equidistant (OpenCV's fisheye, Kannala-Brandt): the factor is on theta / r as well.
+    """
+
+    radial: tuple[float, ...] = ()
+    divisor: tuple[float, ...] = ()
+    tangential: tuple[float, float] = (0.0, 0.0)
+    fisheye: bool = False
+
+    @property
+    def is_pinhole(self) -> bool:
+        """Whether nothing is distorted."""
+        return not (self.fisheye or any((*self.radial, *self.divisor, *self.tangential)))
+
+
+def distort(
+    lens: Lens, x: Float[np.ndarray, "*S"], y: Float[np.ndarray, "*S"]
+) -> tuple[Float[np.ndarray, "*S"], Float[np.ndarray, "*S"]]:
+    """Where the lens images the directions (x, y, 1)."""
+    r2 = x**2 + y**2
+    if lens.fisheye:
+        r = np.sqrt(r2)
+        theta = np.arctan(r)
+        factor = np.where(r > 1e-8, theta / np.maximum(r, 1e-8), 1).astype(r.dtype) * _polynomial(lens.radial, theta**2)
+    else:
+        factor = _polynomial(lens.radial, r2)
+    if lens.divisor:
+        factor = factor / _polynomial(lens.divisor, r2)
+    p1, p2 = lens.tangential
+    return (
+        x * factor + 2 * p1 * x * y + p2 * (r2 + 2 * x**2),
+        y * factor + 2 * p2 * x * y + p1 * (r2 + 2 * y**2),
+    )
+
+
+def undistort(
+    image: Float32[np.ndarray, "H W C"], K: Float[np.ndarray, "3 3"], lens: Lens
+) -> Float32[np.ndarray, "H W C"]:
+    """The picture that the pinhole camera `without_skew(K)` would have taken.
+
+    Pixels that the lens did not see repeat the nearest one that it did.
+
+    Args:
+        image: as taken through the lens.
+        K: intrinsics of `image`, skew included.
+        lens: its distortion.
+    """
+    if lens.is_pinhole and K[0, 1] == 0:
+        return image
+    columns, rows = _places(image.shape[1], image.shape[0], tuple(K[:2].ravel().tolist()), lens)
+    warped = cv2.remap(image, columns, rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    return np.clip(warped.reshape(image.shape), 0, 1)  # cubic interpolation overshoots
+
+
+def scale_intrinsics(K: Float[np.ndarray, "3 3"], factor: int) -> Float[np.ndarray, "3 3"]:
+    """Intrinsics of a picture shrunk by `factor`; exact because pixel centres lie at +0.5."""
+    return K / np.array([[factor], [factor], [1]])
+
+
+def without_skew(K: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
+    """Intrinsics of the pictures that `undistort` returns."""
+    return np.where(np.arange(9).reshape(3, 3) == 1, 0.0, K)
+
+
+def _polynomial(coefficients: tuple[float, ...], s: Float[np.ndarray, "*S"]) -> Float[np.ndarray, "*S"]:
+    """1 + k1 s + k2 s^2 + ..."""
+    value = np.zeros_like(s)
+    for coefficient in reversed(coefficients):
+        value = (value + coefficient) * s
+    return 1 + value
+
+
+@functools.lru_cache(maxsize=4)  # most scenes have one camera
+def _places(
+    width: int, height: int, K: tuple[float, ...], lens: Lens
+) -> tuple[Float32[np.ndarray, "H W"], Float32[np.ndarray, "H W"]]:
+    """Column and row of the distorted picture, centres counted from 0, that each pixel of the straight one shows."""
+    fx, skew, cx, _, fy, cy = K
+    x = ((np.arange(width) + 0.5 - cx)[None, :] / fx).astype(np.float32)  # to a thousandth of a pixel; twice as fast
+    y = ((np.arange(height) + 0.5 - cy)[:, None] / fy).astype(np.float32)
+    with np.errstate(all="ignore"):  # a nonsensical lens leads out of the picture
+        lens_x, lens_y = distort(lens, *np.broadcast_arrays(x, y))
+        columns, rows = fx * lens_x + skew * lens_y + cx - 0.5, fy * lens_y + cy - 0.5
+    return _for_cubic(columns, width), _for_cubic(rows, height)
+
+
+# cv2's cubic kernel (a = -0.75) shows a ramp, at the offset o from a pixel, as 1.5 o - 1.5 o^2 + o^3, up to 0.05 pixels
+# off. This is the inverse, for offsets in steps of 1 / 4096.
+_OFFSETS = (0.5 + np.sinh(np.arcsinh(4 * np.linspace(0, 1, 4097) - 2) / 3)).astype(np.float32)
+
+
+def _for_cubic(places: Float32[np.ndarray, "H W"], length: int) -> Float32[np.ndarray, "H W"]:
+    """What to ask cv2's cubic interpolation for to get the values at `places`; far ones come near the border."""
+    places = np.clip(np.nan_to_num(places, nan=-8), -8, length + 8)
+    whole = np.floor(places)
+    return whole + _OFFSETS[np.rint(4096 * (places - whole)).astype(np.int32)]

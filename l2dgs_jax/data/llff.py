@@ -1,0 +1,112 @@
+"""The layout of LLFF (arXiv 1905.00889): `poses_bounds.npy` beside the pictures.
+
+    poses_bounds.npy   [F, 17]: pose [3, 5] (axes down, right, back; position; height, width, focal length), near, far
+    images/<name>, in the order of their names   [images_<k>/<name>, k times smaller]
+    [a point cloud, see `clouds.beside`]   [dataset.json]   [metadata.json]   as Nerfies has them
+
+Alpha 0 marks pixels that do not count.
+"""
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+
+from l2dgs_jax.data import clouds, colmap_model, splits
+from l2dgs_jax.data.assembly import Frame, assemble
+from l2dgs_jax.data.dataset import Dataset
+from l2dgs_jax.data.lens import Lens
+from l2dgs_jax.data.parsing import read_array, rotation
+from l2dgs_jax.data.pictures import by_name, copies
+from l2dgs_jax.data.writing import write_lists, write_pictures
+from l2dgs_jax.errors import UserError
+from l2dgs_jax.files import new_folder
+
+FILE = "poses_bounds.npy"
+_AXES = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1]])  # (down, right, back) from (right, down, forward), and back
+
+
+def recognizes(folder: Path) -> bool:
+    """Whether the folder has this layout, and not also the COLMAP model that its poses come from, which knows more."""
+    return (folder / FILE).is_file() and colmap_model.find(folder) is None
+
+
+def read(folder: Path, downscale: int, held_out: str) -> Dataset:
+    """Read a scene; without a point cloud, random points fill the views between the bounds.
+
+    Args:
+        folder: of the scene.
+        downscale: factor on the full size of the images.
+        held_out: see `splits.choose`; without lists every eighth frame is held out.
+
+    Raises:
+        UserError: a file is missing, malformed or inconsistent.
+    """
+    path, root = folder / FILE, folder / "images"
+    rows = read_array(path, "the frames' poses and bounds, shape (F, 17)").astype(np.float64)
+    if rows.ndim != 2 or rows.shape[1] != 17:
+        raise UserError(f"{path}: the array has shape {rows.shape}; expected (F, 17)")
+    if not root.is_dir():
+        raise UserError(f"{root}: no such folder; expected the scene's pictures")
+    names = sorted(by_name(root))
+    if len(names) != len(rows):
+        raise UserError(f"{path}: has {len(rows)} poses for the {len(names)} pictures in {root}; expected one each")
+    train, test = splits.choose(str(path), names, splits.lists_beside(folder, names), held_out, default="8")
+    times = splits.instants(folder, names)
+    described = {name: _camera(f"{path}, row {i}", row) for i, (name, row) in enumerate(zip(names, rows, strict=True))}
+
+    def frames(chosen: list[str]) -> list[Frame]:
+        return [
+            Frame(name, f"{path}, row {names.index(name)}", *described[name], times[name], picture)
+            for name, picture in zip(chosen, copies(root, downscale, chosen), strict=True)
+        ]
+
+    cloud = clouds.beside(folder)
+    notes: tuple[str, ...] = ()
+    if cloud is None:
+        viewmats, Ks, _, sizes = zip(*described.values(), strict=True)
+        cloud = clouds.in_frusta(np.stack(viewmats), np.stack(Ks), sizes[0], rows[:, 15:]), None
+        notes = (f"{folder} has no point cloud: {clouds.COUNT} random points between the bounds stand in for one",)
+    return assemble(folder, frames(train), frames(test), *cloud, downscale, notes)
+
+
+def write(dataset: Dataset, folder: Path) -> None:
+    """Write a scene so that `read` gives it back; pictures get 8 bits.
+
+    Raises:
+        UserError: a camera is not one that the layout can describe; or the folder holds files already or cannot be
+            written.
+    """
+    rows = {}
+    for split in (dataset.train, dataset.test):
+        for name, viewmat, K in zip(split.names, split.cameras.viewmat, split.cameras.K, strict=True):
+            if K[0, 0] != K[1, 1] or K[0, 2] != dataset.width / 2 or K[1, 2] != dataset.height / 2:
+                raise UserError(f"--to llff: the camera of '{name}' is off centre or has oblong pixels; expected none")
+            depths = (dataset.points @ viewmat[:3, :3].T + viewmat[:3, 3])[:, 2]
+            bounds = np.percentile(depths[depths > 0], (0.1, 99.9)) * (0.9, 1.1) if (depths > 0).any() else (1.0, 100.0)
+            world = np.linalg.inv(np.asarray(viewmat, np.float64))
+            last = np.array([[dataset.height], [dataset.width], [K[0, 0]]])
+            pose = np.concatenate([world[:3, :3] @ _AXES, world[:3, 3:], last], -1)
+            rows[name] = np.concatenate([pose.ravel(), bounds])
+    with new_folder(folder) as place:
+        write_pictures(dataset, place / "images", place)
+        write_lists(dataset, place)
+        np.save(place / FILE, np.stack([rows[name] for name in sorted(rows)]))
+        clouds.write_ply(place / clouds.FILES[0], dataset.points, dataset.colors)
+
+
+def _camera(
+    source: str, row: Float64[np.ndarray, "17"]
+) -> tuple[Float64[np.ndarray, "4 4"], Float64[np.ndarray, "3 3"], Lens, tuple[int, int]]:
+    """World to camera, intrinsics, lens and size."""
+    pose = row[:15].reshape(3, 5)
+    height, width, focal = pose[:, 4]
+    if not (1 <= width < 2**31 and 1 <= height < 2**31 and focal > 0 and 0 < row[15] < row[16]):
+        raise UserError(
+            f"{source}: size {width}x{height}, focal length {focal}, bounds {row[15]} to {row[16]}; expected "
+            "positive numbers and the nearer bound first"
+        )
+    world = np.eye(4)
+    world[:3, :3], world[:3, 3] = rotation(f"{source}: the pose", pose[:, :3] @ _AXES), pose[:, 3]
+    K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+    return np.linalg.inv(world), K, Lens(), (round(width), round(height))

@@ -1,0 +1,135 @@
+"""Which frames are held out, and the instants of frames: what the files say, else rules."""
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from l2dgs_jax.data.parsing import name_list, numbers, read_json, value
+from l2dgs_jax.errors import UserError
+
+Lists = tuple[list[str], list[str]]  # names to train on, names held out
+NO_LISTS: Lists = ([], [])
+
+_DIGITS = re.compile(r"[0-9]+")
+
+
+def check_rule(rule: str) -> None:
+    """Complain if `choose` does not know the rule.
+
+    Raises:
+        UserError: it does not.
+    """
+    if rule not in ("auto", "4dgs") and not (re.fullmatch(r"[0-9]{1,6}", rule) and int(rule) >= 2):
+        raise UserError(f"--held-out {rule}: expected auto, 4dgs, or a whole number k from 2 for every k-th frame")
+
+
+def choose(source: str, names: Sequence[str], own: Lists, rule: str, default: str) -> Lists:
+    """Names to train on and names held out.
+
+    Args:
+        source: what lists the frames, for messages.
+        names: all frames in order.
+        own: the scene's own lists, empty if it has none.
+        rule: "auto" (the scene's own lists, else the default), "4dgs" (arXiv 2310.08528: train on every fourth frame,
+            hold out those halfway between), or a number k: the first and then every k-th are held out, the others
+            trained on (3DGS, arXiv 2308.04079, with 8).
+        default: the rule for scenes of this layout without lists.
+
+    Raises:
+        UserError: too few frames on either side.
+    """
+    if rule == "auto" and own[1]:
+        train, test = own
+    else:
+        rule = default if rule == "auto" else rule
+        if rule == "4dgs":
+            train, test = list(names[::4]), list(names[2::4][: (len(names) - 1) // 4])
+        else:
+            test = list(names[:: int(rule)])
+            train = [name for i, name in enumerate(names) if i % int(rule)]
+    if len(train) < 2 or not test:
+        raise UserError(
+            f"{source}: {len(train)} frames to train with and {len(test)} held out, of {len(names)} listed; expected "
+            "at least 2 and 1, or 5 in all if none is marked as held out"
+        )
+    return train, test
+
+
+def lists(folder: Path) -> tuple[list[str], Lists]:
+    """All frames, and those to train on and held out, of `dataset.json`, else of `splits/{train,val}.json`.
+
+    Raises:
+        UserError: neither is there, or one is malformed.
+    """
+    path = folder / "dataset.json"
+    has_splits = (folder / "splits").is_dir()
+    content = {} if has_splits and not path.exists() else read_json(path, "the lists of frames")
+    ids: list[str] = []
+    if has_splits and not {"ids", "train_ids"} & content.keys():
+        files = (folder / "splits" / f"{part}.json" for part in ("train", "val"))
+        train, test = (name_list(file, read_json(file, "a list of frames"), "frame_names") for file in files)
+    else:
+        ids = name_list(path, content, "ids") if "ids" in content else []
+        train = name_list(path, content, "train_ids") if "train_ids" in content or not ids else []
+        test = name_list(path, content, "val_ids") if "val_ids" in content else []
+    return ids if {*train, *test} <= {*ids} else sorted({*train, *test}), (train, test)
+
+
+def lists_beside(folder: Path, names: Sequence[str]) -> Lists:
+    """The lists of a `dataset.json` in a scene whose own layout has none.
+
+    Raises:
+        UserError: it is malformed or lists frames that the scene does not have.
+    """
+    path = folder / "dataset.json"
+    if not path.exists() or "train_ids" not in read_json(path, "the lists of frames"):
+        return NO_LISTS
+    own = lists(folder)[1]
+    unknown = sorted({*own[0], *own[1]} - {*names})
+    if unknown:
+        raise UserError(f"{path}: lists '{unknown[0]}', which the scene does not have; expected the scene's frames")
+    return own
+
+
+def instants(folder: Path, names: Sequence[str]) -> dict[str, float]:
+    """The frames' instants in [0, 1].
+
+    From `metadata.json`: "time" as `normalised`, else "warp_id" or "time_id" spread over [0, 1]. Without it the last
+    numbers in the names, spread, if all names have one and they differ; else the order of the names.
+
+    Raises:
+        UserError: `metadata.json` is malformed or knows some frames and not others.
+    """
+    path = folder / "metadata.json"
+    metadata = read_json(path, "the frames' instants") if path.exists() else {}
+    known = metadata.keys() & set(names)
+    entries = [value(path, metadata, name, dict) for name in names] if known else []
+    key = next((key for key in ("time", "warp_id", "time_id") if any(key in entry for entry in entries)), None)
+    if key:
+        moments = np.array([float(numbers(path, entry, key, ())) for entry in entries])
+        moments = normalised(moments) if key == "time" else _spread(moments)
+    else:
+        moments = _spread(_from_names(names))
+    return dict(zip(names, moments.tolist(), strict=True))
+
+
+def normalised(times: Float[np.ndarray, " F"]) -> Float[np.ndarray, " F"]:
+    """Times as they are if they lie in [0, 1], else spread over it."""
+    return times if times.min() >= 0 and times.max() <= 1 else _spread(times)
+
+
+def _spread(values: Float[np.ndarray, " F"]) -> Float[np.ndarray, " F"]:
+    if np.abs(values).max() > 1e300:
+        values = values / 4  # no difference overflows
+    return (values - values.min()) / (np.ptp(values) or 1.0)
+
+
+def _from_names(names: Sequence[str]) -> Float[np.ndarray, " F"]:
+    found = [_DIGITS.findall(name) for name in names]
+    numbers = [int(digits[-1][-15:]) for digits in found if digits]
+    if len(numbers) == len(names) and len(set(numbers)) > 1:
+        return np.array(numbers, float)
+    return np.arange(len(names), dtype=float)

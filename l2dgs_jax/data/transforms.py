@@ -1,0 +1,215 @@
+"""The layouts of Blender, D-NeRF (arXiv 2011.13961), instant-ngp and nerfstudio.
+
+    transforms.json, or transforms_{train,test,val}.json     frames, cameras (axes right, up, back) and instants
+    the pictures that they name   [images_<k>/<name> beside images/<name>, k times smaller]
+    [a point cloud, see `clouds.beside`]   [dataset.json]   [metadata.json]   as Nerfies has them
+
+Alpha says how much of a pixel the scene covers: pictures are composited over black, which is what a scene renders where
+nothing is.
+"""
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+
+from l2dgs_jax.data import clouds, splits
+from l2dgs_jax.data.assembly import Frame, assemble
+from l2dgs_jax.data.dataset import Dataset
+from l2dgs_jax.data.images import SUFFIXES, read_header
+from l2dgs_jax.data.lens import Lens
+from l2dgs_jax.data.parsing import name_list, numbers, read_json, rotation, value
+from l2dgs_jax.data.pictures import Picture, copies
+from l2dgs_jax.data.splits import NO_LISTS, Lists
+from l2dgs_jax.data.writing import write_json, write_pictures
+from l2dgs_jax.errors import UserError
+from l2dgs_jax.files import new_folder
+
+_AXES = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL's camera axes from OpenCV's, and back
+_PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
+_FISHEYE = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
+
+
+def recognizes(folder: Path) -> bool:
+    """Whether the folder has this layout."""
+    return any((folder / f"transforms{part}.json").is_file() for part in ("", "_train"))
+
+
+def read(folder: Path, downscale: int, held_out: str) -> Dataset:
+    """Read a scene; without a point cloud, random points fill a box that all cameras look at.
+
+    Args:
+        folder: of the scene.
+        downscale: factor on the full size of the images.
+        held_out: see `splits.choose`; without lists every eighth frame is held out.
+
+    Raises:
+        UserError: a file is missing, malformed or inconsistent.
+    """
+    entries, own, ply = _entries(folder)
+    names = list(entries)
+    own = own if own[1] else splits.lists_beside(folder, names)
+    train, test = splits.choose(str(folder), names, own, held_out, default="8")
+    times = _times(folder, entries)
+    pictures = _pictures(folder, {name: entries[name][2] for name in [*train, *test]}, downscale)
+    frames = {name: _frame(name, *entries[name], times[name], picture) for name, picture in pictures.items()}
+
+    cloud = clouds.beside(folder, ply)
+    notes: tuple[str, ...] = ()
+    if cloud is None:
+        cloud = clouds.in_common_box(np.stack([frame.viewmat for frame in frames.values()]), str(folder)), None
+        notes = (f"{folder} has no point cloud: {clouds.COUNT} random points where its cameras look stand in for one",)
+    return assemble(folder, [frames[n] for n in train], [frames[n] for n in test], *cloud, downscale, notes)
+
+
+def write(dataset: Dataset, folder: Path) -> None:
+    """Write a scene as nerfstudio has it so that `read` gives it back; pictures get 8 bits.
+
+    Raises:
+        UserError: some pixels are not valid, which the layout cannot say; or the folder holds files already or cannot
+            be written.
+    """
+    files: dict[str, list[str]] = {"train": [], "val": []}
+    frames = []
+    for part, split in (("train", dataset.train), ("val", dataset.test)):
+        if split.valid is not None:
+            raise UserError("--to transforms: some pixels of the scene are not valid; expected nerfies, colmap or llff")
+        for name, viewmat, K, time in zip(split.names, *split.cameras, strict=True):
+            files[part].append(f"images/{name}.png")
+            world = np.linalg.inv(np.asarray(viewmat, np.float64)) @ _AXES
+            intrinsics = dict(zip(("fl_x", "fl_y", "cx", "cy"), map(float, (K[0, 0], K[1, 1], *K[:2, 2])), strict=True))
+            entry = {"file_path": files[part][-1], "time": float(time), "transform_matrix": world.tolist()}
+            frames.append(entry | intrinsics)
+    content = {
+        "camera_model": "OPENCV",
+        "w": dataset.width,
+        "h": dataset.height,
+        "ply_file_path": clouds.FILES[0],
+        "train_filenames": files["train"],
+        "val_filenames": files["val"],
+        "test_filenames": files["val"],
+        "frames": sorted(frames, key=lambda frame: frame["file_path"]),
+    }
+    with new_folder(folder) as place:
+        write_pictures(dataset, place / "images", place)
+        write_json(place / "transforms.json", content)
+        clouds.write_ply(place / clouds.FILES[0], dataset.points, dataset.colors)
+
+
+Entry = tuple[Path, dict[str, Any], Path]  # the file that lists a frame, what it says of it, and the frame's picture
+
+
+def _entries(folder: Path) -> tuple[dict[str, Entry], Lists, str | None]:
+    """Every frame by name, the layout's own lists, and the point cloud that it names."""
+    single = folder / "transforms.json"
+    if single.is_file():
+        content = read_json(single, "the frames")
+        entries = _listed(single, content)
+        parts = [
+            next((name_list(single, content, key) for key in keys if key in content), [])
+            for keys in (("train_filenames",), ("test_filenames", "val_filenames"))
+        ]
+        train, test = ([_name(folder, _picture(single, file)) for file in files] for files in parts)
+        unknown = sorted({*train, *test} - entries.keys())
+        if unknown:
+            raise UserError(f"{single}: lists '{unknown[0]}', which is not among its frames; expected one of them")
+        ply = value(single, content, "ply_file_path", str) if content.get("ply_file_path") else None
+        return entries, (train, test) if train and test else NO_LISTS, ply
+    lists: list[list[str]] = []
+    entries = {}
+    held_out = next((part for part in ("test", "val") if (folder / f"transforms_{part}.json").is_file()), None)
+    for part in ("train", held_out):
+        path = folder / f"transforms_{part}.json"
+        found = _listed(path, read_json(path, "the frames")) if part else {}
+        lists.append([name for name in found if name not in entries])
+        entries |= found
+    return entries, (lists[0], lists[1]), None
+
+
+def _listed(path: Path, content: dict[str, Any]) -> dict[str, Entry]:
+    """The frames of a file, with what it says of all of them, in the order of their names."""
+    shared = {key: entry for key, entry in content.items() if key != "frames"}
+    entries = {}
+    for i, frame in enumerate(value(path, content, "frames", list)):
+        if not isinstance(frame, dict):
+            raise UserError(f"{path}: frame {i} is no JSON object; expected file_path and transform_matrix")
+        picture = _picture(path, value(path, frame, "file_path", str))
+        entries[_name(path.parent, picture)] = (path, shared | frame, picture)
+    return dict(sorted(entries.items()))
+
+
+def _picture(path: Path, file: str) -> Path:
+    """The file that an entry names, with or without its suffix."""
+    named = path.parent / file
+    candidates = [named, *(named.with_name(f"{named.name}{suffix}") for suffix in SUFFIXES if named.name)]
+    found = next((candidate for candidate in candidates if os.path.isfile(candidate)), None)
+    if found is None:
+        raise UserError(f"{named}: no such file; expected the picture that {path} names")
+    return found
+
+
+def _name(folder: Path, picture: Path) -> str:
+    """A picture's path without its suffix, relative to `images` or to the scene."""
+    for root in (folder / "images", folder):
+        if picture.is_relative_to(root):
+            return picture.relative_to(root).with_suffix("").as_posix()
+    return picture.stem
+
+
+def _times(folder: Path, entries: dict[str, Entry]) -> dict[str, float]:
+    """The frames' own instants, else those of `splits.instants`."""
+    if not any("time" in content for _, content, _ in entries.values()):
+        return splits.instants(folder, list(entries))
+    times = np.array([float(numbers(path, content, "time", ())) for path, content, _ in entries.values()])
+    return dict(zip(entries, splits.normalised(times).tolist(), strict=True))
+
+
+def _pictures(folder: Path, files: dict[str, Path], downscale: int) -> dict[str, Picture]:
+    """The frames' own files, or smaller copies of those in `images`."""
+    root = folder / "images"
+    inside = [name for name, file in files.items() if file.is_relative_to(root)]
+    plain = {name: Picture(file, 1) for name, file in files.items()}
+    return plain | dict(zip(inside, copies(root, downscale, inside) if inside else (), strict=True))
+
+
+def _frame(name: str, path: Path, content: dict[str, Any], file: Path, time: float, picture: Picture) -> Frame:
+    source = f"{path}, frame '{name}'"
+    matrix = numbers(path, content, "transform_matrix", (4, 4))
+    rotation(f"{source}: 'transform_matrix'", matrix[:3, :3])
+    if not np.allclose(matrix[3], [0, 0, 0, 1]):
+        raise UserError(f"{source}: the last row of 'transform_matrix' is {matrix[3]}; expected 0 0 0 1")
+    if "w" in content and "h" in content:
+        size = int(numbers(path, content, "w", ())), int(numbers(path, content, "h", ()))
+    else:
+        size = read_header(file).size
+    if min(size) < 1:
+        raise UserError(f"{source}: 'w' and 'h' are {size}; expected positive numbers of pixels")
+    K, lens = _intrinsics(path, source, content, size)
+    return Frame(name, source, np.linalg.inv(matrix @ _AXES), K, lens, size, time, picture, alpha="coverage")
+
+
+def _intrinsics(
+    path: Path, source: str, content: dict[str, Any], size: tuple[int, int]
+) -> tuple[Float64[np.ndarray, "3 3"], Lens]:
+    number = lambda key, default: float(numbers(path, content, key, ())) if key in content else default
+
+    def focal(axis: str, length: int) -> float:
+        if f"fl_{axis}" not in content and f"camera_angle_{axis}" in content:
+            return length / 2 / np.tan(number(f"camera_angle_{axis}", 0.0) / 2)
+        return number(f"fl_{axis}", 0.0)
+
+    with np.errstate(all="ignore"):
+        fx, fy = focal("x", size[0]), focal("y", size[1])
+    fy = fy or fx
+    if not (0 < fx < 1e18 and 0 < fy < 1e18):
+        raise UserError(f"{source}: has no positive focal length; expected 'fl_x' or 'camera_angle_x'")
+    model = content.get("camera_model", "OPENCV")
+    if model not in _PERSPECTIVE + _FISHEYE:
+        raise UserError(f"{source}: 'camera_model' is {model!r}; expected one of {', '.join(_PERSPECTIVE + _FISHEYE)}")
+    K = np.array([[fx, 0, number("cx", size[0] / 2)], [0, fy, number("cy", size[1] / 2)], [0, 0, 1]])
+    radial = tuple(number(f"k{i}", 0.0) for i in (1, 2, 3, 4))
+    if model in _FISHEYE or content.get("is_fisheye"):
+        return K, Lens(radial, fisheye=True)
+    return K, Lens(radial, tangential=(number("p1", 0.0), number("p2", 0.0)))
