@@ -25,7 +25,7 @@ from l2dgs_jax.files import new_folder, replacing
 
 FEWEST_FRAMES = 5
 FEWEST_REGISTERED = 0.5  # part of the frames
-LEAST_BASELINE = 0.02  # of the median depth, under which depth is a guess
+LEAST_PARALLAX = 0.05  # part of the pairs of frames that must show some
 ADVICE = (
     "film more slowly, with more light and more overlap, and walk instead of turning on the spot; "
     "or try more --frames, or another --camera-model"
@@ -112,6 +112,12 @@ def prepare(options: Prepare, work: Path, folder: Path) -> dict:
     moving = _mask(place, names, copies)
     structure.find_features(place, names, options.camera_model)
     structure.match_features(place, names)
+    pairs, with_parallax = structure.count_pairs(place)
+    if with_parallax < LEAST_PARALLAX * pairs:
+        raise UserError(
+            f"{options.source}: {with_parallax} of {pairs} pairs of frames show parallax, so the camera only turns or "
+            f"sees a flat surface; expected a camera that moves through the scene: {ADVICE}"
+        )
     model = structure.reconstruct(place, len(names))
 
     missing = report.reasons(place, names, model)
@@ -130,11 +136,6 @@ def prepare(options: Prepare, work: Path, folder: Path) -> dict:
         "not_registered": missing,
         "origins": {candidates[i].name: candidates[i].origin for i in chosen},
     }
-    if found["baseline_to_depth"] < LEAST_BASELINE:
-        raise UserError(
-            f"{options.source}: the camera moves by {found['baseline_to_depth']} of the scene's depth only; expected "
-            f"at least {LEAST_BASELINE}: {ADVICE}"
-        )
     _write(folder, place, model, [name for name in names if name not in missing])
     shutil.copyfile(work / "contact_sheet.png", folder / "contact_sheet.png")
     (folder / "report.json").write_text(json.dumps(found, indent=2) + "\n")

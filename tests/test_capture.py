@@ -116,7 +116,7 @@ def test_clips_of_any_darkness_come_out_alike(light):
 
 
 def test_well_lit_clips_stay_as_they_are():
-    image = 0.2 + 0.8 * random_image()
+    image = np.repeat(0.2 + 0.8 * random_image()[..., :1], 3, axis=-1)
     tone = brighten.tone_for([image])
     assert tone == (1.0, 1.0, 0.0)
     np.testing.assert_allclose(brighten.brighten(image, tone) / 255, frames.luma(image), atol=0.51 / 255)

@@ -108,6 +108,16 @@ def still_video(folder):
     return folder / "tripod.avi"
 
 
+def panning_video(folder):
+    pictures = []
+    for angle in np.linspace(-0.2, 0.2, 8):
+        turn = np.eye(4)
+        turn[:3, :3] = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
+        pictures.append(images.to_bytes(0.3 * clips.render(turn @ clips.camera(0.0))[0]))
+    clips.write_video(folder / "pan.avi", pictures)
+    return folder / "pan.avi"
+
+
 def one_frame(folder):
     clips.write_video(folder / "photo.avi", [np.zeros((48, 64, 3), np.uint8)])
     return folder / "photo.avi"
@@ -153,6 +163,7 @@ def foreign(folder):
 FAULTS = {
     "one frame": ("photo.avi: holds 1 frame(s)", one_frame),
     "tripod": ("tripod.avi: the camera stands still", still_video),
+    "turning on the spot": ("pan.avi: 0 of", panning_video),
     "no video": ("notes.txt: not a video that OpenCV can read", file("notes.txt", b"dark")),
     "empty video": ("clip.mp4: not a video that OpenCV can read", file("clip.mp4")),
     "zip": ("frames.zip: not a video that OpenCV can read", file("frames.zip", b"PK\x03\x04" + bytes(100))),

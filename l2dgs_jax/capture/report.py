@@ -15,7 +15,7 @@ from l2dgs_jax.visualize import GAP, cell, text_strip
 FEW_FEATURES = 100
 FEW_MATCHES = 30  # under which COLMAP attempts no pose
 COLUMNS = 6  # of the contact sheet
-MOST_CELLS = 60
+MOST_CELLS = 36
 
 _GREEN, _RED = (80, 255, 80), (255, 70, 70)
 

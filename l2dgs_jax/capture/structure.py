@@ -17,6 +17,7 @@ CameraModel = Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "O
 LARGEST_SIDE = 1600  # pixels that features are found in
 OVERLAP = 10  # neighbours in time that each frame is matched with, and further ones at 2, 4, 8 ... times that
 SMALLEST_MODEL = 3  # frames
+FEWEST_POINTS = 50  # in a model
 ENOUGH = 0.9  # part of the frames with which the first attempt is taken
 
 
@@ -116,6 +117,15 @@ def offsets(count: int) -> list[int]:
     return offsets
 
 
+def count_pairs(place: Workplace) -> tuple[int, int]:
+    """How many pairs of frames were verified, and how many of them show parallax: no homography explains them."""
+    kinds = pycolmap().TwoViewGeometryConfiguration
+    flat = {int(kind) for kind in (kinds.PLANAR, kinds.PANORAMIC, kinds.PLANAR_OR_PANORAMIC)}
+    with pycolmap().Database.open(place.database) as database:
+        found = [int(pair.config) for pair in database.read_two_view_geometries()[1] if len(pair.inlier_matches)]
+    return len(found), sum(kind not in flat for kind in found)
+
+
 def reconstruct(place: Workplace, count: int) -> Any:
     """Poses and points: the largest model, or None if there is none.
 
@@ -142,17 +152,24 @@ def _map(place: Workplace, count: int, distorted: bool) -> Any:
     place.models.mkdir(exist_ok=True)
     description = "poses, with distortion" if distorted else "poses"
     with tqdm(total=count, desc=description, unit="frame", dynamic_ncols=True) as bar:
+
+        def begin() -> None:  # also when an attempt is given up for another pair of frames
+            bar.reset()
+            bar.update(2)
+
         models = colmap.incremental_mapping(
             place.database,
             place.frames,
             place.models,
             options,
-            initial_image_pair_callback=lambda: bar.reset() or bar.update(2),
+            initial_image_pair_callback=begin,
             next_image_callback=bar.update,
         )
     if not models:
         return None
     model = max(models.values(), key=_size)
+    if model.num_points3D() < FEWEST_POINTS:
+        return None
     _adjust(model, place.threads)
     return model
 
