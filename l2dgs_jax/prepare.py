@@ -7,7 +7,6 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -21,7 +20,7 @@ from l2dgs_jax.capture.frames import Candidate
 from l2dgs_jax.capture.structure import CameraModel, Workplace
 from l2dgs_jax.data import images
 from l2dgs_jax.errors import UserError
-from l2dgs_jax.files import new_folder, replacing
+from l2dgs_jax.files import expect_new, new_folder, replacing
 
 FEWEST_FRAMES = 5
 FEWEST_REGISTERED = 0.5  # part of the frames
@@ -62,11 +61,11 @@ def main(arguments: Sequence[str]) -> None:
     structure.pycolmap()
     if not options.source.exists():
         raise UserError(f"{options.source}: no such file or folder; expected a video or a folder of frames")
+    expect_new(options.output)
     try:
-        with new_folder(options.output) as folder:
-            work = _open_work(options)
-            found = prepare(options, work, folder)
-        shutil.rmtree(work)
+        found = prepare(options, _open_work(options))
+    except OSError as error:
+        raise UserError(f"{options.output}: cannot be made ({error.strerror}); expected a writable place") from None
     except KeyboardInterrupt:
         print("\ninterrupted; the same command goes on from here", file=sys.stderr)
         sys.exit(130)
@@ -74,13 +73,12 @@ def main(arguments: Sequence[str]) -> None:
     print(f"next: look at {options.output / 'contact_sheet.png'}, then python -m l2dgs_jax.train {options.output}")
 
 
-def prepare(options: Prepare, work: Path, folder: Path) -> dict:
-    """Fill `folder` with frames, COLMAP's model, `report.json` and `contact_sheet.png`.
+def prepare(options: Prepare, work: Path) -> dict:
+    """Make the scene: frames, COLMAP's model, `report.json` and `contact_sheet.png`.
 
     Args:
         options: of the command line.
-        work: what earlier calls with the same options have done.
-        folder: empty.
+        work: folder of what earlier calls with the same options have done; removed once the scene is whole.
 
     Returns:
         The report.
@@ -136,20 +134,27 @@ def prepare(options: Prepare, work: Path, folder: Path) -> dict:
         "not_registered": missing,
         "origins": {candidates[i].name: candidates[i].origin for i in chosen},
     }
-    _write(folder, place, model, [name for name in names if name not in missing])
-    shutil.copyfile(work / "contact_sheet.png", folder / "contact_sheet.png")
-    (folder / "report.json").write_text(json.dumps(found, indent=2) + "\n")
+    with new_folder(options.output) as folder:
+        (folder / "images").mkdir()
+        for name in names:
+            if name not in missing:
+                shutil.copyfile(place.frames / name, folder / "images" / name)
+        (folder / "sparse" / "0").mkdir(parents=True)
+        model.write_binary(folder / "sparse" / "0")
+        shutil.copyfile(work / "contact_sheet.png", folder / "contact_sheet.png")
+        (folder / "report.json").write_text(json.dumps(found, indent=2) + "\n")
+    shutil.rmtree(work)
     return found
 
 
 def _open_work(options: Prepare) -> Path:
     """The folder of intermediate results; those of other settings or of another source are cleared away."""
     work = options.output.absolute().with_name(f"{options.output.absolute().name}.partial")
-    stat = options.source.stat()
+    inside = options.source.iterdir() if options.source.is_dir() else ()
     settings = json.dumps(
         {
             "source": str(options.source.absolute()),
-            "changed": stat.st_mtime_ns,
+            "changed": max(path.stat().st_mtime_ns for path in (options.source, *inside)),
             "frames": options.frames,
             "camera_model": options.camera_model,
         },
@@ -163,7 +168,7 @@ def _open_work(options: Prepare) -> Path:
             print(f"going on in {work}")
             return work
         shutil.rmtree(work)
-    work.mkdir()
+    work.mkdir(parents=True)
     record.write_text(settings)
     return work
 
@@ -209,14 +214,6 @@ def _mask(
     with replacing(record) as temporary:
         np.savez_compressed(temporary, moving=np.stack(moving))
     return moving
-
-
-def _write(folder: Path, place: Workplace, model: Any, names: Sequence[str]) -> None:
-    (folder / "images").mkdir()
-    for name in names:
-        shutil.copyfile(place.frames / name, folder / "images" / name)
-    (folder / "sparse" / "0").mkdir(parents=True)
-    model.write_binary(folder / "sparse" / "0")
 
 
 def _failure(options: Prepare, work: Path, names: Sequence[str], missing: dict[str, str]) -> str:

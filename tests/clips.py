@@ -72,6 +72,14 @@ def clip(count: int, *, reach: float = 1.0, light: float = 1.0, block: bool = Tr
     return pictures, views, [square for _, square in drawn]
 
 
+def through_lens(picture: np.ndarray, k1: float) -> np.ndarray:
+    """The picture that a lens of radial distortion `k1` takes."""
+    K = np.array([[FOCAL, 0, WIDTH / 2 - 0.5], [0, FOCAL, HEIGHT / 2 - 0.5], [0, 0, 1]])
+    pixels = np.stack(np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT)), -1).reshape(-1, 1, 2).astype(np.float32)
+    straight = cv2.undistortPoints(pixels, K, np.array([k1, 0, 0, 0]), P=K).reshape(HEIGHT, WIDTH, 2)
+    return cv2.remap(picture, straight, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT).clip(0, 1)
+
+
 def write_video(path, pictures, codec: str = "FFV1") -> None:
     """Write 8-bit RGB pictures at 25 frames a second."""
     height, width = pictures[0].shape[:2]

@@ -1,13 +1,15 @@
 import json
+import os
 import shutil
 import sys
+from dataclasses import replace
 
 import clips
 import numpy as np
 import pytest
 from scenes import write_image
 
-from l2dgs_jax import prepare
+from l2dgs_jax import data, prepare
 from l2dgs_jax.capture import frames, structure
 from l2dgs_jax.data import demo, images
 from l2dgs_jax.errors import UserError
@@ -81,6 +83,10 @@ def test_dark_frames_get_poses_also_after_an_interruption(source, tmp_path, monk
     distance, angle = pose_errors(model, dict(zip(names, views, strict=True)))
     assert distance < 0.005
     assert angle < 0.5
+    dataset = data.load(output)
+    assert len(dataset.train.names) + len(dataset.test.names) == COUNT
+    times = dict(zip(dataset.train.names, dataset.train.cameras.time, strict=True))
+    assert all(time == pytest.approx((int(name) - 5) / (COUNT - 1)) for name, time in times.items())
     colors = np.array([point.color for point in model.points3D.values()])
     assert colors.mean() < 0.3 * 255  # of the dark frames, not of the bright copies
     for name in names:
@@ -191,6 +197,13 @@ def test_a_fault_is_named_in_one_sentence_and_nothing_is_written(tmp_path, fault
     assert (tmp_path / "out").exists() == (fault == "output exists")
 
 
+def test_a_place_that_cannot_be_written_is_named(tmp_path):
+    source = pictures(tmp_path)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UserError, match=r"out: cannot be made \(Not a directory\); expected a writable place"):
+        run(source, tmp_path / "file" / "out")
+
+
 @pytest.mark.parametrize("option", [("--frames", "2"), ("--threads", "-1")])
 def test_options_out_of_range(tmp_path, option):
     with pytest.raises(UserError, match=f"{' '.join(option)}: expected"):
@@ -204,14 +217,37 @@ def test_missing_package_names_the_extra(tmp_path, monkeypatch):
     assert not (tmp_path / "out.partial").exists()
 
 
-def test_other_settings_begin_anew(tmp_path):
+def test_other_settings_or_pictures_begin_anew(tmp_path):
     source = pictures(tmp_path)
     options = prepare.Prepare(source, tmp_path / "out")
     work = prepare._open_work(options)
     (work / "candidates.json").write_text("[]")
     assert (prepare._open_work(options) / "candidates.json").exists()
-    other = prepare._open_work(prepare.Prepare(source, tmp_path / "out", frames=7))
-    assert not (other / "candidates.json").exists()
+    assert not (prepare._open_work(replace(options, frames=7)) / "candidates.json").exists()
+    (work / "candidates.json").write_text("[]")
+    os.utime(source / "a 3.png", (2e9, 2e9))  # repaired in place
+    assert not (prepare._open_work(replace(options, frames=7)) / "candidates.json").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("k1", [-0.1, -0.3])
+def test_lens_distortion_is_found(tmp_path, k1):
+    for i, picture in enumerate(clips.clip(COUNT, light=0.3)[0]):
+        write_image(tmp_path / "source" / f"{i}.png", images.to_bytes(clips.through_lens(picture, k1)))
+    run(tmp_path / "source", tmp_path / "out")
+    found = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert found["registered"] == COUNT
+    focal, *_, distortion = found["camera"]["params"]
+    assert focal == pytest.approx(clips.FOCAL, rel=0.03)
+    assert distortion == pytest.approx(k1, abs=0.03)
+
+
+@pytest.mark.slow
+def test_one_thread_gives_the_same_numbers_every_time(source, tmp_path):
+    for name in ("first", "second"):
+        run(source[0], tmp_path / name)
+    first, second = ((tmp_path / name / "sparse/0/points3D.bin").read_bytes() for name in ("first", "second"))
+    assert first == second
 
 
 @pytest.mark.slow
