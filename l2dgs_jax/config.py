@@ -10,6 +10,8 @@ import math
 from dataclasses import dataclass, field
 from typing import Literal
 
+Layout = Literal["auto", "nerfies", "colmap", "transforms", "llff"]
+
 
 @dataclass(frozen=True)
 class ModelConfig:
@@ -118,7 +120,7 @@ class Config:
     batch_size: int = 2  # views a step
     seed: int = 0
     downscale: int = 1  # reads images at 1/downscale of their full size
-    format: Literal["auto", "nerfies", "colmap", "transforms", "llff"] = "auto"  # layout of the scene's folder
+    format: Layout = "auto"  # of the scene's folder; "auto": found from its contents
     held_out: str = "auto"  # views not trained on: the scene's own, "4dgs", or k for every k-th (data/splits.py)
     sh_warmup: int = 1000  # steps between activating one more SH band
     checkpoint_every: int = 500  # steps

@@ -8,6 +8,7 @@ from typing import Literal
 import tyro
 
 from l2dgs_jax import cli
+from l2dgs_jax.config import Layout
 from l2dgs_jax.data import LAYOUTS, load
 
 
@@ -19,7 +20,7 @@ class Convert:
         scene: folder of the scene, or "demo" for the clip that comes with the package.
         output: folder to make.
         to: layout to write.
-        format: layout of the scene's folder; found from its contents if not given.
+        format: layout of the scene's folder; "auto": found from its contents.
         downscale: whole factor by which to shrink the pictures.
         held_out: views to mark as held out: the scene's own ("auto"), "4dgs", or k for every k-th.
     """
@@ -27,7 +28,7 @@ class Convert:
     scene: tyro.conf.Positional[str]
     output: tyro.conf.Positional[Path]
     to: Literal["nerfies", "colmap", "transforms", "llff"]
-    format: Literal["auto", "nerfies", "colmap", "transforms", "llff"] = "auto"
+    format: Layout = "auto"
     downscale: int = 1
     held_out: str = "auto"
 

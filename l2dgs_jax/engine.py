@@ -122,10 +122,7 @@ def objective(
     cfg = config.loss
     start, steps = (config.coarse_steps, config.fine_steps) if moving else (0, config.coarse_steps)
     eta = losses.eta(state.step - start, steps, cfg) if cfg.eta_restarts else losses.eta(state.step, config.steps, cfg)
-    target, counted = batch.images, jnp.ones((), batch.images.dtype)
-    if batch.valid is not None:
-        target = jnp.where(batch.valid[..., None], target, jax.lax.stop_gradient(output.images.lowlight))
-        counted = jnp.maximum(batch.valid.mean(dtype=target.dtype), 1e-6)
+    target, counted = targets(batch, output.images.lowlight)
     loss, terms = losses.total(output, target, cfg, eta, exponent_target(config))
     if moving:
         smoothness, time_smoothness, time_l1 = hexplane.regularisers(params.hexplane)
@@ -133,6 +130,19 @@ def objective(
     mse = jnp.mean(jnp.square(output.images.lowlight - target)) / counted
     report = StepReport(loss, terms, -10 * jnp.log10(mse), output.pairs, output.overflow, jnp.isfinite(loss))
     return loss, (report, output.radii)
+
+
+def targets(
+    batch: Batch, estimate: Float[Array, "V H W 3"]
+) -> tuple[Float[Array, "V H W 3"], Float[Array, ""] | float]:
+    """What the low-light estimate is compared with, and the share of pixels that count.
+
+    Where pixels are not valid the estimate is compared with itself, held constant: nothing can be learned there.
+    """
+    if batch.valid is None:
+        return batch.images, 1.0
+    target = jnp.where(batch.valid[..., None], batch.images, jax.lax.stop_gradient(estimate))
+    return target, jnp.maximum(batch.valid.mean(dtype=target.dtype), 1e-6)
 
 
 @partial(jax.jit, static_argnames=("config", "moving", "pair_capacity"), donate_argnums=0)

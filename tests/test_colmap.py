@@ -110,6 +110,9 @@ def test_pictures_are_found_where_users_keep_them(scene, place):
         shutil.move(path, scene / "sparse" / path.name)
     (scene / "sparse" / "0").rmdir()
     assert np.array_equal(data.load(scene).train.images, expected.train.images)
+    for path in (scene / place).glob("*.png"):
+        write_image(scene.parent / "scene_2" / path.name, np.ones((12, 16, 3)))  # another scene
+    assert data.load(scene, 2).train.images.max() < 0.5
 
 
 def test_smaller_copies_are_used(scene):

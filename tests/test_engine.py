@@ -141,25 +141,39 @@ def test_probe_gradient_is_the_gradient_of_moving_on_screen(dataset):
 def test_nothing_is_learned_from_pixels_that_do_not_count(dataset):
     config = tiny()
     valid = np.random.default_rng(0).random((FRAMES, HEIGHT, WIDTH)) < 0.7
-    states = []
-    for wrong in (0.0, 1.0, None):
-        images = dataset.train.images if wrong is None else np.where(valid[..., None], dataset.train.images, wrong)
-        split = dataclasses.replace(
-            dataset.train, images=images.astype(np.float16), valid=np.ones_like(valid) if wrong is None else valid
-        )
-        masked = dataclasses.replace(dataset, train=split)
-        state = engine.initial_state(masked, config)
+    estimate = jax.random.uniform(jax.random.key(0), (2, HEIGHT, WIDTH, 3))
+    states, targets = [], []
+    for wrong in (0.0, 1.0):
+        images = np.where(valid[..., None], dataset.train.images, wrong).astype(np.float16)
+        split = dataclasses.replace(dataset.train, images=images, valid=valid)
+        states.append(engine.initial_state(dataclasses.replace(dataset, train=split), config))
         batch = engine.load_batch(split, np.array([1, 4]))
-        states.append(engine.train_step(state, batch, config, moving=False, pair_capacity=4096))
-    assert_equal_states(states[0], states[1])
-    assert states[2][1].loss != states[0][1].loss
+        batch = batch._replace(images=jnp.asarray(batch.images, float))
+        targets.append(engine.targets(batch, estimate))
+        assert jnp.all(jax.grad(lambda x, batch=batch: engine.targets(batch, x)[0].sum())(estimate) == 0)
+    assert_equal_states(*states)
+    assert_equal_states(*targets)
+    seen = valid[[1, 4]]
+    np.testing.assert_array_equal(targets[0][0][~seen], estimate[~seen])
+    np.testing.assert_array_equal(targets[0][0][seen], dataset.train.images[[1, 4]][seen])
+    np.testing.assert_allclose(targets[0][1], seen.mean())
+
+
+def test_a_step_takes_a_mask_of_pixels_that_count(dataset):
+    config = tiny()
     state = engine.initial_state(dataset, config)
-    plain = jax.tree.map(lambda x: jnp.asarray(x, float), engine.load_batch(dataset.train, np.array([1, 4])))
     probe = jnp.zeros((2, state.scene.alive.shape[0], 2))
-    without_mask = jax.jit(lambda p: engine.objective(p, probe, state, plain, config, False, 4096)[1][0])
-    report = without_mask(state.scene.params)
-    np.testing.assert_allclose(states[2][1].loss, report.loss, rtol=1e-6)
-    np.testing.assert_allclose(states[2][1].psnr, report.psnr, rtol=1e-6)
+    batch = jax.tree.map(lambda x: jnp.asarray(x, float), engine.load_batch(dataset.train, np.array([1, 4])))
+    half = jnp.arange(WIDTH) < WIDTH // 2
+    report = jax.jit(
+        lambda valid: engine.objective(
+            state.scene.params, probe, state, batch._replace(valid=valid), config, False, 4096
+        )[1][0]
+    )
+    masks = [jnp.broadcast_to(mask, (2, HEIGHT, WIDTH)) for mask in (half | True, half, ~half)]
+    whole, left, right = (10 ** (-report(mask).psnr / 10) for mask in masks)
+    np.testing.assert_allclose(whole, (left + right) / 2, rtol=1e-9)  # mean squares of halves
+    assert not np.isclose(left, right)
 
 
 def test_training_lowers_the_loss_and_grows(dataset):

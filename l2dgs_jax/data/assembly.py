@@ -139,9 +139,9 @@ def _read_split(folder: Path, part: str, frames: Sequence[Frame], width: int, he
         return _filled(read, (len(frames), height, width, 3))
 
     def majority(values: Float16[np.ndarray, "F H W 3"] | None) -> Bool[np.ndarray, "F H W"] | None:
-        return None if values is None else values[..., 0] > 0.5
+        return None if values is None else values.mean(-1) > 0.5
 
-    valid = np.ones((len(frames), height, width), bool)
+    marked: dict[int, Bool[np.ndarray, "H W"]] = {}  # of the frames whose pixels do not all count
 
     def read_frame(index: int) -> Float32[np.ndarray, "H W 3"]:
         frame = frames[index]
@@ -150,10 +150,13 @@ def _read_split(folder: Path, part: str, frames: Sequence[Frame], width: int, he
             image *= alpha
         elif alpha is not None and frame.alpha == "validity":
             # A pixel counts if nothing that it was made from is marked.
-            valid[index] = fit(frame, frame.image.scale, (alpha > 0.5).astype(np.float32))[..., 0] > 0.999
+            counts = fit(frame, frame.image.scale, (alpha > 0.5).astype(np.float32))[..., 0] > 0.999
+            if not counts.all():
+                marked[index] = counts
         return fit(frame, frame.image.scale, image)
 
     lowlight = _filled(read_frame, (len(frames), height, width, 3))
+    all_count = np.ones((height, width), bool)
     K = [scale_intrinsics(without_skew(frame.K), downscale) for frame in frames]
     return Split(
         names=tuple(names),
@@ -165,7 +168,7 @@ def _read_split(folder: Path, part: str, frames: Sequence[Frame], width: int, he
         images=lowlight,
         welllit=read_all(folder / "well"),
         masks=majority(read_all(folder / "mask")),
-        valid=None if valid.all() else valid,
+        valid=np.stack([marked.get(i, all_count) for i in range(len(frames))]) if marked else None,
         covisible=majority(read_all(folder / "covisible", f"{part}/")),
     )
 

@@ -55,7 +55,7 @@ def read(folder: Path, downscale: int, held_out: str) -> Dataset:
 
     def frames(chosen: list[str]) -> list[Frame]:
         described = []
-        for name, picture in zip(chosen, copies(root, downscale, chosen), strict=True):
+        for name, picture in zip(chosen, copies(folder, root, downscale, chosen), strict=True):
             image = by_stem[name]
             if image.camera not in cameras:
                 raise UserError(f"{place}: '{image.name}' has camera {image.camera}; expected one that the model lists")
@@ -108,10 +108,11 @@ def pinhole_and_lens(camera: ModelCamera) -> tuple[Float64[np.ndarray, "3 3"], L
 
 
 def _root(folder: Path, names: list[str]) -> Path:
-    """The folder that the images' names are relative to: `images`, else the first one that holds the first image."""
-    if (folder / "images").is_dir():
-        return folder / "images"
-    for place in (folder, *sorted(path for path in folder.iterdir() if path.is_dir())):
-        if names[0] in by_name(place):
+    """The folder that the images' names are relative to: `images` or another that holds the first one."""
+    usual = folder / "images"
+    for place in (usual, folder, *sorted(path for path in folder.iterdir() if path.is_dir())):
+        if place.is_dir() and names[0] in by_name(place):
             return place
-    raise UserError(f"{folder / 'images'}: no such folder; expected the pictures that the model was made from")
+    if not usual.is_dir():
+        raise UserError(f"{usual}: no such folder; expected the pictures that the model was made from")
+    return usual

@@ -5,6 +5,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 import OpenImageIO as oiio  # noqa: N813
 from jaxtyping import Bool, Float, Float32, Shaped, UInt8
@@ -51,9 +52,8 @@ def read_image_and_alpha(path: Path) -> tuple[Float32[np.ndarray, "H W 3"], Floa
     pixels = _upright(np.asarray(pixels, np.float32), _orientation(spec))
     if _is_float(spec) and not np.isfinite(pixels).all():
         raise UserError(f"{path}: holds NaN or infinite values; expected finite colours")
-    channels = [0, 1, 2] if pixels.shape[-1] >= 3 else [0, 0, 0]
-    color = np.ascontiguousarray(pixels[..., channels])
-    alpha = spec.alpha_channel
+    color = pixels[..., :3] if pixels.shape[-1] >= 3 else np.repeat(pixels[..., :1], 3, axis=-1)
+    color, alpha = np.ascontiguousarray(color), spec.alpha_channel
     return (
         srgb_from_linear(color) if _is_linear(spec) else color,
         None if alpha < 0 else np.ascontiguousarray(pixels[..., alpha : alpha + 1]),
@@ -104,9 +104,9 @@ def area_average(image: Float32[np.ndarray, "H W C"], factor: int) -> Float32[np
     Rows and columns that fill no block are cropped from the bottom and the right, so that dividing K by `factor`
     stays exact.
     """
-    height, width = image.shape[0] // factor, image.shape[1] // factor
-    blocks = image[: height * factor, : width * factor].reshape(height, factor, width, factor, -1)
-    return blocks.mean((1, 3))
+    height, width, channels = image.shape[0] // factor, image.shape[1] // factor, image.shape[2]
+    whole = image[: height * factor, : width * factor]
+    return cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA).reshape(height, width, channels)
 
 
 def _open(path: Path) -> oiio.ImageInput:

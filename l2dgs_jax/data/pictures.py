@@ -43,13 +43,15 @@ def stored_if_any(root: Path, downscale: int, names: Sequence[str]) -> list[Pict
     return stored(root, downscale, names)
 
 
-def copies(root: Path, downscale: int, names: Sequence[str]) -> list[Picture]:
+def copies(scene: Path, root: Path, downscale: int, names: Sequence[str]) -> list[Picture]:
     """Each frame's picture in `root`, or in `<root>_<k>` beside it for the largest such k that divides `downscale`.
+
+    Only folders within the `scene`'s are looked at.
 
     Raises:
         UserError: pictures of frames are missing.
     """
-    factors = [k for k in range(downscale, 1, -1) if downscale % k == 0]
+    factors = [k for k in range(downscale, 1, -1) if downscale % k == 0 and root != scene]
     scale = next((k for k in factors if root.with_name(f"{root.name}_{k}").is_dir()), 1)
     folder = root if scale == 1 else root.with_name(f"{root.name}_{scale}")
     files = by_name(folder)

@@ -27,6 +27,8 @@ from l2dgs_jax.data.writing import write_json, write_pictures
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.files import new_folder
 
+Entry = tuple[Path, dict[str, Any], Path]  # the file that lists a frame, what it says of it, and the frame's picture
+
 _AXES = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL's camera axes from OpenCV's, and back
 _PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
 _FISHEYE = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
@@ -96,9 +98,6 @@ def write(dataset: Dataset, folder: Path) -> None:
         write_pictures(dataset, place / "images", place)
         write_json(place / "transforms.json", content)
         clouds.write_ply(place / clouds.FILES[0], dataset.points, dataset.colors)
-
-
-Entry = tuple[Path, dict[str, Any], Path]  # the file that lists a frame, what it says of it, and the frame's picture
 
 
 def _entries(folder: Path) -> tuple[dict[str, Entry], Lists, str | None]:
@@ -171,7 +170,7 @@ def _pictures(folder: Path, files: dict[str, Path], downscale: int) -> dict[str,
     root = folder / "images"
     inside = [name for name, file in files.items() if file.is_relative_to(root)]
     plain = {name: Picture(file, 1) for name, file in files.items()}
-    return plain | dict(zip(inside, copies(root, downscale, inside) if inside else (), strict=True))
+    return plain | dict(zip(inside, copies(folder, root, downscale, inside) if inside else (), strict=True))
 
 
 def _frame(name: str, path: Path, content: dict[str, Any], file: Path, time: float, picture: Picture) -> Frame:
