@@ -37,8 +37,7 @@ def new_folder(path: Path) -> Iterator[Path]:
     Raises:
         UserError: `path` exists and is no empty folder, or its place is not writable.
     """
-    if path.is_symlink() or (path.exists() and (not path.is_dir() or any(path.iterdir()))):
-        raise UserError(f"{path}: exists already; expected a new or an empty folder to write to")
+    expect_new(path)
     place = path.absolute()
     try:
         place.parent.mkdir(parents=True, exist_ok=True)
@@ -51,3 +50,13 @@ def new_folder(path: Path) -> Iterator[Path]:
             os.rename(filled, place)
     except OSError as error:
         raise UserError(f"{path}: cannot be written ({error.strerror}); expected a writable place") from None
+
+
+def expect_new(path: Path) -> None:
+    """Complain early of what `new_folder` would complain of.
+
+    Raises:
+        UserError: `path` exists and is no empty folder.
+    """
+    if path.is_symlink() or (path.exists() and (not path.is_dir() or any(path.iterdir()))):
+        raise UserError(f"{path}: exists already; expected a new or an empty folder to write to")

@@ -76,9 +76,9 @@ def sheet(
     """Pictures of one size in rows under headings, each row below its caption."""
     lines = []
     for caption, pictures in rows:
-        cells = np.hstack([np.pad(_cell(picture), ((0, GAP), (0, GAP), (0, 0))) for picture in pictures])
-        lines += [_text(caption, cells.shape[1]), cells]
-    header = np.hstack([_text(heading, lines[1].shape[1] // len(headings)) for heading in headings])
+        cells = np.hstack([np.pad(cell(picture), ((0, GAP), (0, GAP), (0, 0))) for picture in pictures])
+        lines += [text_strip(caption, cells.shape[1]), cells]
+    header = np.hstack([text_strip(heading, lines[1].shape[1] // len(headings)) for heading in headings])
     return np.vstack([header, *lines])
 
 
@@ -180,18 +180,7 @@ def write_video(path: Path, frames: Iterable[UInt8[np.ndarray, "H W 3"]], fps: i
             writer.write(cv2.cvtColor(even, cv2.COLOR_RGB2BGR))
 
 
-def _nearby(at: Float[np.ndarray, " A"], times: Float[np.ndarray, " F"], bandwidth: float) -> Float[np.ndarray, "A F"]:
-    """Gaussian weights of the views around each instant; rows sum to 1."""
-    exponent = -0.5 * ((at[:, None] - times[None]) / bandwidth) ** 2
-    weights = np.exp(exponent - exponent.max(-1, keepdims=True))
-    return weights / weights.sum(-1, keepdims=True)
-
-
-def _rms(offsets: Float[np.ndarray, "F 3"]) -> float:
-    return float(np.sqrt((offsets**2).sum(-1).mean()))
-
-
-def _cell(picture: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "h w 3"]:
+def cell(picture: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "h w 3"]:
     """The picture at a legible width: enlarged by whole pixels, or reduced."""
     narrow, wide = CELL_WIDTHS
     height, width = picture.shape[:2]
@@ -201,6 +190,18 @@ def _cell(picture: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "h w 3"]:
     return picture.repeat(factor, axis=0).repeat(factor, axis=1)
 
 
-def _text(text: str, width: int) -> UInt8[np.ndarray, "h w 3"]:
+def text_strip(text: str, width: int) -> UInt8[np.ndarray, "h w 3"]:
+    """One line of text, white on black; what does not fit is cut off."""
     strip = np.zeros((STRIP, width, 3), np.uint8)
     return cv2.putText(strip, text, (4, STRIP - 7), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (255, 255, 255), 1, cv2.LINE_AA)
+
+
+def _nearby(at: Float[np.ndarray, " A"], times: Float[np.ndarray, " F"], bandwidth: float) -> Float[np.ndarray, "A F"]:
+    """Gaussian weights of the views around each instant; rows sum to 1."""
+    exponent = -0.5 * ((at[:, None] - times[None]) / bandwidth) ** 2
+    weights = np.exp(exponent - exponent.max(-1, keepdims=True))
+    return weights / weights.sum(-1, keepdims=True)
+
+
+def _rms(offsets: Float[np.ndarray, "F 3"]) -> float:
+    return float(np.sqrt((offsets**2).sum(-1).mean()))

@@ -39,12 +39,14 @@ ORDER = [
     "runs",
     "cli",
     "visualize",
+    "capture",
     "render",
     "evaluate",
     "train",
     "convert",
     "masks",
     "simulate",
+    "prepare",
 ]
 PACKAGE = Path(l2dgs_jax.__file__).parent
 MODULES = [path for path in PACKAGE.rglob("*.py") if path != PACKAGE / "__init__.py"]

@@ -150,7 +150,7 @@ def test_contact_sheet_without_held_out_views_or_truth_shows_training_views(run)
 
 
 def test_wide_pictures_are_reduced_in_the_contact_sheet():
-    cell = visualize._cell(np.full((300, 1000, 3), 77, np.uint8))
+    cell = visualize.cell(np.full((300, 1000, 3), 77, np.uint8))
     assert cell.shape == (120, 400, 3)
     assert (cell == 77).all()
 

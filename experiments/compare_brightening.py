@@ -1,0 +1,48 @@
+"""Which brighter copy of dark frames gets the most of them registered: `compare_brightening.py FRAMES_OR_VIDEO`.
+
+Prepares the same frames with each of the curves below, on one thread, and prints what comes of it. The copy that flow
+and features see is all that differs.
+"""
+
+import argparse
+import tempfile
+from pathlib import Path
+
+import cv2
+
+from l2dgs_jax import prepare
+from l2dgs_jax.capture import brighten
+from l2dgs_jax.capture.brighten import Tone
+from l2dgs_jax.errors import UserError
+
+DEFAULT = brighten.brighten
+CURVES = {
+    "as they are": lambda image, tone: DEFAULT(image, Tone(1.0, 1.0, 0.0)),
+    "gain and exponent": lambda image, tone: DEFAULT(image, tone._replace(smoothing=0.0)),
+    "gain, exponent, CLAHE": lambda image, tone: cv2.createCLAHE(3, (8, 8)).apply(
+        DEFAULT(image, tone._replace(smoothing=0.0))
+    ),
+    "gain, exponent, smoothing": DEFAULT,
+}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("source", type=Path)
+    options = parser.parse_args()
+    for name, curve in CURVES.items():
+        brighten.brighten = curve
+        with tempfile.TemporaryDirectory() as folder:
+            work, output = Path(folder) / "work", Path(folder) / "out"
+            work.mkdir()
+            try:
+                found = prepare.prepare(prepare.Prepare(options.source, output, threads=1), work)
+            except UserError as error:
+                print(f"{name}: {error}")
+                continue
+        figures = {key: found[key] for key in ("registered", "sampled", "points", "reprojection_error_px")}
+        print(f"{name}: {figures}, focal length {found['camera']['focal_length_px']}", flush=True)
+
+
+if __name__ == "__main__":
+    main()
