@@ -125,10 +125,12 @@ def inverse_depths(
     return 0.5 / float(farthest), 2 / float(nearest)
 
 
-def optical_flow(first: UInt8[np.ndarray, "H W"], second: UInt8[np.ndarray, "H W"]) -> Float32[np.ndarray, "H W 2"]:
-    """Dense optical flow by inverse search (DIS, arXiv 1603.03590), to the finest scale."""
+def optical_flow(
+    first: UInt8[np.ndarray, "H W"], second: UInt8[np.ndarray, "H W"], finest_scale: int = 0
+) -> Float32[np.ndarray, "H W 2"]:
+    """Dense optical flow by inverse search (DIS, arXiv 1603.03590), down to pixels of 2^`finest_scale`."""
     search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    search.setFinestScale(0)
+    search.setFinestScale(finest_scale)
     return search.calc(first, second, None)  # type: ignore[call-overload]
 
 

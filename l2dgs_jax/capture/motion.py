@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
 from l2dgs_jax.capture.frames import shrink
+from l2dgs_jax.motion import match, optical_flow
 
 WORKING_SIZE = 512  # longer side of the pictures that flow is computed on, pixels
 NEIGHBOURS = (2, 4)  # how many frames before and after each one those are that it is compared with
@@ -61,32 +62,22 @@ def _distances_to_epipolar_lines(
     first: UInt8[np.ndarray, "h w"], second: UInt8[np.ndarray, "h w"]
 ) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w"]]:
     """Sampson distance in pixels of the flow from each picture to the other; NaN where it is not to be trusted."""
-    height, width = first.shape
-    columns, rows = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
-    here = np.stack([columns, rows], -1)
-    forth, back = here + _flow(first, second), here + _flow(second, first)
-    trusted, trusted_back = _returns(forth, back), _returns(back, forth)
+    there, back = _flow(first, second), _flow(second, first)
+    forth, returned = match(there, back), match(back, there)
+    here = forth.places - there
+    trusted, trusted_back = forth.errors < _CONSISTENT, returned.errors < _CONSISTENT
 
     grid = (slice(_SPACING // 2, None, _SPACING),) * 2
     usable = (trusted & _textured(first))[grid]
-    distance, distance_back = np.full((2, height, width), np.nan)
+    distance, distance_back = np.full((2, *first.shape), np.nan)
     if usable.sum() < _FEWEST:
         return distance, distance_back
     cv2.setRNGSeed(0)
-    F, _ = cv2.findFundamentalMat(here[grid][usable], forth[grid][usable], cv2.USAC_MAGSAC, 0.5, 0.999, 5000)
+    F, _ = cv2.findFundamentalMat(here[grid][usable], forth.places[grid][usable], cv2.USAC_MAGSAC, 0.5, 0.999, 5000)
     if F is not None and F.shape == (3, 3):
-        distance[trusted] = _sampson(F, here[trusted], forth[trusted])
-        distance_back[trusted_back] = _sampson(F, back[trusted_back], here[trusted_back])
+        distance[trusted] = _sampson(F, here[trusted], forth.places[trusted])
+        distance_back[trusted_back] = _sampson(F, returned.places[trusted_back], here[trusted_back])
     return distance, distance_back
-
-
-def _returns(forth: Float32[np.ndarray, "h w 2"], back: Float32[np.ndarray, "h w 2"]) -> Bool[np.ndarray, "h w"]:
-    """Where flow to the other picture and back leads to about where it started."""
-    height, width = forth.shape[:2]
-    far = (1e6, 1e6)
-    returned = cv2.remap(back, forth[..., 0], forth[..., 1], cv2.INTER_LINEAR, borderValue=far)
-    columns, rows = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
-    return np.hypot(returned[..., 0] - columns, returned[..., 1] - rows) < _CONSISTENT
 
 
 def _sampson(
@@ -100,7 +91,7 @@ def _sampson(
 
 
 def _flow(first: UInt8[np.ndarray, "h w"], second: UInt8[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w 2"]:
-    return cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM).calc(first, second, None)  # type: ignore
+    return optical_flow(first, second, finest_scale=1)  # three times as fast, and no more is needed here
 
 
 def _textured(picture: UInt8[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
