@@ -12,6 +12,7 @@ import numpy as np
 
 from l2dgs_jax.data import demo
 from l2dgs_jax.data.images import area_average, read_image, to_bytes, write_image
+from l2dgs_jax.data.writing import write_json
 
 FACTOR = 2
 README = """# The demo clip
@@ -45,24 +46,20 @@ def make(source: Path, target: Path, frames: int) -> None:
         camera["skew"] /= FACTOR
         camera["principal_point"] = [x / FACTOR for x in camera["principal_point"]]
         camera["image_size"] = [x // FACTOR for x in camera["image_size"]]
-        _write_json(target / "camera" / f"{name}.json", camera)
+        write_json(target / "camera" / f"{name}.json", camera)
         image = area_average(read_image(source / "rgb" / "1x" / f"{name}.png"), FACTOR)
         write_image(target / "rgb" / "1x" / f"{name}.png", to_bytes(image))
 
     train_ids = [name for name in ids if name not in val_ids]
     lists = {"count": len(ids), "num_exemplars": len(train_ids)}
-    _write_json(target / "dataset.json", lists | {"ids": ids, "train_ids": train_ids, "val_ids": val_ids})
+    write_json(target / "dataset.json", lists | {"ids": ids, "train_ids": train_ids, "val_ids": val_ids})
     metadata = json.loads((source / "metadata.json").read_text())
-    _write_json(target / "metadata.json", {name: metadata[name] for name in ids})
+    write_json(target / "metadata.json", {name: metadata[name] for name in ids})
     for file in ("scene.json", "points_rgb.npy", "LICENSE"):
         shutil.copyfile(source / file, target / file)
     np.save(target / "points.npy", np.load(source / "points.npy").astype(np.float32))
     width, height = camera["image_size"]
     (target / "README.md").write_text(README.format(count=len(ids), width=width, height=height))
-
-
-def _write_json(path: Path, content: dict) -> None:
-    path.write_text(json.dumps(content) + "\n")
 
 
 if __name__ == "__main__":

@@ -10,7 +10,8 @@ import math
 from dataclasses import dataclass, field
 from typing import Literal
 
-Layout = Literal["auto", "nerfies", "colmap", "transforms", "llff"]
+LayoutName = Literal["nerfies", "colmap", "transforms", "llff"]
+Layout = Literal["auto"] | LayoutName
 
 
 @dataclass(frozen=True)

@@ -3,12 +3,11 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import tyro
 
 from l2dgs_jax import cli
-from l2dgs_jax.config import Layout
+from l2dgs_jax.config import Layout, LayoutName
 from l2dgs_jax.data import LAYOUTS, load
 
 
@@ -27,7 +26,7 @@ class Convert:
 
     scene: tyro.conf.Positional[str]
     output: tyro.conf.Positional[Path]
-    to: Literal["nerfies", "colmap", "transforms", "llff"]
+    to: LayoutName
     format: Layout = "auto"
     downscale: int = 1
     held_out: str = "auto"

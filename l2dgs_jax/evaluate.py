@@ -94,7 +94,7 @@ def evaluate(run: Run, split_name: str = "test") -> dict:
     if split.masks is not None or split.covisible is not None:
         result["lowlight_regions"] = scores
     if split.masks is not None:
-        result["mask_area"] = float(split.masks.mean())
+        result["mask_area"] = float(split.masks.mean(where=True if split.valid is None else split.valid))
     if split.welllit is not None:
         plain, gained, gain = _with_gain(np.stack(welllit), split.welllit, split)
         result |= {"welllit": {region: plain[region] | gained[region] for region in plain}, "gain": gain}

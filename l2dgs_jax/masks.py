@@ -13,6 +13,7 @@ from jaxtyping import Bool, UInt8
 from tqdm import tqdm
 
 from l2dgs_jax import cli
+from l2dgs_jax.config import Layout
 from l2dgs_jax.data import load
 from l2dgs_jax.data.dataset import Dataset, Original
 from l2dgs_jax.data.images import to_bytes, write_image
@@ -35,12 +36,16 @@ class Masks:
     Attributes:
         scene: folder of the scene.
         downscale: whole factor by which the images that are looked at are smaller than full size.
-        overwrite: replace the masks that the scene has.
+        format: layout of the scene's folder; "auto": found from its contents.
+        held_out: rule for the views not trained on, as train has it; frames that it does not use get no mask.
+        overwrite: replace the masks that the scene has, of every size.
         preview: picture to write, showing frames with what moves tinted.
     """
 
     scene: tyro.conf.Positional[Path]
     downscale: int = 1
+    format: Layout = "auto"
+    held_out: str = "auto"
     overwrite: bool = False
     preview: Path | None = None
 
@@ -48,16 +53,18 @@ class Masks:
 def main(arguments: Sequence[str]) -> None:
     """Write the masks of a scene as the command line says."""
     options = cli.parse(Masks, arguments, "masks")
-    dataset = load(options.scene, options.downscale)
-    folder = options.scene / "mask" / "1x"
-    if not options.overwrite and not (dataset.train.masks is None and dataset.test.masks is None):
-        raise UserError(f"{folder.parent}: holds masks of this scene; expected none, or --overwrite to replace them")
-    if folder.parent.exists() and not folder.parent.is_dir():
-        raise UserError(f"{folder.parent}: is a file; expected a folder, or nothing, to write masks to")
+    folder = options.scene / "mask"
+    if folder.exists() and not folder.is_dir():
+        raise UserError(f"{folder}: is a file; expected a folder, or nothing, to write masks to")
+    if not options.overwrite and folder.exists() and any(folder.iterdir()):
+        raise UserError(f"{folder}: holds masks of this scene; expected none, or --overwrite to replace them")
+    dataset = load(options.scene, options.downscale, options.format, options.held_out)
     if not os.access(options.scene, os.W_OK):
         raise UserError(f"{options.scene}: cannot be written; expected a writable folder to put masks in")
     if options.preview and not options.preview.parent.is_dir():
         raise UserError(f"--preview {options.preview}: cannot be written; expected a file in an existing folder")
+    for note in dataset.notes:
+        print(f"note: {note}")
 
     masks = compute(dataset)
     names = [*dataset.train.names, *dataset.test.names]
@@ -67,7 +74,7 @@ def main(arguments: Sequence[str]) -> None:
         names,
         [as_taken(mask, options.downscale, original) for mask, original in zip(masks, originals, strict=True)],
     )
-    print(f"wrote {len(names)} masks to {folder}; {100 * masks.mean():.1f} % of the pixels move")
+    print(f"wrote {len(names)} masks to {folder / "1x"}; {100 * masks.mean():.1f} % of the pixels move")
     if options.preview:
         write_image(options.preview, preview(dataset, masks))
 
@@ -100,21 +107,19 @@ def as_taken(mask: Bool[np.ndarray, "h w"], downscale: int, original: Original) 
 
 
 def write(folder: Path, names: Sequence[str], masks: Sequence[Bool[np.ndarray, "H W"]]) -> None:
-    """Write `folder/NAME.png`, all of them or none; what was in `folder` is gone afterwards.
+    """Write `folder/1x/NAME.png`, all of them or none; what was in `folder` is gone afterwards.
 
     Raises:
         UserError: the folder cannot be written.
     """
-    scene = folder.parent.parent
     try:
-        # Beside mask/, because a scene with an empty mask/ cannot be read.
-        with tempfile.TemporaryDirectory(dir=scene, prefix=".mask-", ignore_cleanup_errors=True) as top:
+        # Beside `folder`, because a scene with an empty one cannot be read.
+        with tempfile.TemporaryDirectory(dir=folder.parent, prefix=".mask-", ignore_cleanup_errors=True) as top:
             new, old = Path(top) / "new", Path(top) / "old"
             for name, mask in zip(names, masks, strict=True):
-                path = new / f"{name}.png"
+                path = new / "1x" / f"{name}.png"
                 path.parent.mkdir(parents=True, exist_ok=True)
                 write_image(path, 255 * mask.astype(np.uint8))
-            folder.parent.mkdir(exist_ok=True)
             if folder.exists():
                 os.rename(folder, old)
             os.rename(new, folder)

@@ -11,10 +11,11 @@ from typing import Literal, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 import tyro
-from jaxtyping import Float16, Float32, UInt8
+from jaxtyping import Bool, Float16, Float32, UInt8
 from tqdm import tqdm
 
 from l2dgs_jax import cli, darkeners, lowlight, metrics, visualize
+from l2dgs_jax.config import Layout
 from l2dgs_jax.data import load, nerfies
 from l2dgs_jax.data.dataset import Dataset, Split
 from l2dgs_jax.data.images import to_bytes, write_image
@@ -38,6 +39,8 @@ class Simulate:
         scene: folder of the scene, in any known layout; its well-lit pictures if it has both kinds.
         output: new folder for the twin.
         downscale: whole factor by which images are smaller than full size.
+        format: layout of the scene's folder; "auto": found from its contents.
+        held_out: rule for the views not trained on, as train has it; frames that it does not use are left out.
         method: one analytic curve for the whole video, or curves by a network, which sees every pixel's neighbourhood.
         weights: of the network: LEDNet's ce_zerodce.pth or an .npz of experiments.train_darkener; else our own.
         exposure: mean lightness of the dark frames, saturated pixels aside; drawn from the range if not given.
@@ -53,6 +56,8 @@ class Simulate:
     scene: tyro.conf.Positional[str]
     output: tyro.conf.Positional[Path]
     downscale: int = 1
+    format: Layout = "auto"
+    held_out: str = "auto"
     method: Literal["analytic", "network"] = "analytic"
     weights: Path | None = None
     exposure: float | None = None
@@ -86,7 +91,10 @@ def simulate(arguments: Sequence[str]) -> None:
     options = cli.parse(Simulate, arguments, "simulate")
     _check(options)
     with new_folder(options.output) as folder:
-        dataset, frames = darken(load(options.scene, options.downscale), options)
+        dataset = load(options.scene, options.downscale, options.format, options.held_out)
+        for note in dataset.notes:
+            print(f"note: {note}")
+        dataset, frames = darken(dataset, options)
         nerfies.write(dataset, folder)
         summary = _summary(frames)
         settings = {key: str(x) if isinstance(x, Path) else x for key, x in dataclasses.asdict(options).items()}
@@ -111,7 +119,7 @@ def darken(dataset: Dataset, options: Simulate) -> tuple[Dataset, dict[str, Fram
     names = dataset.train.names + dataset.test.names
     pictures = [to_bytes(picture) for picture in _sources(dataset)]
     exposures = _exposures(len(names), options)
-    darkener = _darkener(pictures, exposures, options)
+    darkener = _darkener(pictures, _counted(dataset), exposures, options)
     frames: dict[str, FrameReport] = {}
     dark: list[Bytes] = []
     for i, name in enumerate(tqdm(names, desc="darken", unit="frame", dynamic_ncols=True)):
@@ -179,6 +187,13 @@ def _sources(dataset: Dataset) -> Iterator[Float16[np.ndarray, "H W 3"]]:
         yield from split.images if split.welllit is None else split.welllit
 
 
+def _counted(dataset: Dataset) -> list[Bool[np.ndarray, "H W"]]:
+    """Which pixels of each frame are valid."""
+    everything = np.ones((dataset.height, dataset.width), bool)
+    splits = (dataset.train, dataset.test)
+    return [x for split in splits for x in (len(split.names) * [everything] if split.valid is None else split.valid)]
+
+
 def _exposures(count: int, options: Simulate) -> list[float]:
     if options.exposure is not None:
         return [options.exposure] * count
@@ -187,14 +202,17 @@ def _exposures(count: int, options: Simulate) -> list[float]:
 
 
 def _darkener(
-    pictures: Sequence[Bytes], exposures: Sequence[float], options: Simulate
+    pictures: Sequence[Bytes],
+    counted: Sequence[Bool[np.ndarray, "H W"]],
+    exposures: Sequence[float],
+    options: Simulate,
 ) -> Callable[[int], lowlight.Darkener]:
-    """The darkener of every frame, by its index.
+    """The darkener of every frame, by its index, as its pixels that count suggest.
 
     Raises:
         UserError: the pictures are no brighter than the exposure, or the weights cannot be read.
     """
-    light = lambda i: lowlight.lightness(_floats(pictures[i]), options.lab_order).ravel()
+    light = lambda i: lowlight.lightness(_floats(pictures[i]), options.lab_order)[counted[i]]
     stride = -(-sum(picture.size // 3 for picture in pictures) // SAMPLE)
     sample = np.concatenate([light(i)[::stride] for i in range(len(pictures))])
     if sample.mean() <= lowlight.exposure_map(sample, min(exposures)).mean():
