@@ -74,7 +74,7 @@ def main(arguments: Sequence[str]) -> None:
         names,
         [as_taken(mask, options.downscale, original) for mask, original in zip(masks, originals, strict=True)],
     )
-    print(f"wrote {len(names)} masks to {folder / "1x"}; {100 * masks.mean():.1f} % of the pixels move")
+    print(f"wrote {len(names)} masks to {folder / '1x'}; {100 * masks.mean():.1f} % of the pixels move")
     if options.preview:
         write_image(options.preview, preview(dataset, masks))
 
