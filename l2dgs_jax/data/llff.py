@@ -2,7 +2,8 @@
 
     poses_bounds.npy   [F, 17]: pose [3, 5] (axes down, right, back; position; height, width, focal length), near, far
     images/<name>, in the order of their names   [images_<k>/<name>, k times smaller]
-    [a point cloud, see `clouds.beside`]   [dataset.json]   [metadata.json]   as Nerfies has them
+    [a point cloud, see `clouds.beside`, else sparse/ as COLMAP has it]
+    [dataset.json]   [metadata.json]   as Nerfies has them
 
 Alpha 0 marks pixels that do not count.
 """
@@ -61,8 +62,10 @@ def read(folder: Path, downscale: int, held_out: str) -> Dataset:
             for name, picture in zip(chosen, copies(folder, root, downscale, chosen), strict=True)
         ]
 
-    cloud = clouds.beside(folder)
+    model, cloud = colmap_model.find(folder), clouds.beside(folder)
     notes: tuple[str, ...] = ()
+    if cloud is None and model:
+        cloud = colmap_model.read_points(model)  # in the same world, as the poses come from it
     if cloud is None:
         viewmats, Ks, _, sizes = zip(*described.values(), strict=True)
         cloud = clouds.in_frusta(np.stack(viewmats), np.stack(Ks), sizes[0], rows[:, 15:]), None

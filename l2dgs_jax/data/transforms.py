@@ -58,7 +58,9 @@ def read(folder: Path, downscale: int, held_out: str) -> Dataset:
     pictures = _pictures(folder, {name: entries[name][2] for name in [*train, *test]}, downscale)
     frames = {name: _frame(name, *entries[name], times[name], picture) for name, picture in pictures.items()}
 
-    cloud = clouds.beside(folder, ply)
+    cloud = clouds.beside(
+        folder, ply
+    )  # a COLMAP model may be there too, but in another world: programs move and scale it
     notes: tuple[str, ...] = ()
     if cloud is None:
         cloud = clouds.in_common_box(np.stack([frame.viewmat for frame in frames.values()]), str(folder)), None
@@ -122,8 +124,16 @@ def _entries(folder: Path) -> tuple[dict[str, Entry], Lists, str | None]:
     for part in ("train", held_out):
         path = folder / f"transforms_{part}.json"
         found = _listed(path, read_json(path, "the frames")) if part else {}
-        lists.append([name for name in found if name not in entries])
-        entries |= found
+        for name in found.keys() & entries.keys():
+            if found[name][2] != entries[name][2]:
+                raise UserError(
+                    f"{path}: frame {found[name][2]} is '{name}' as {entries[name][2]} is; expected names that differ"
+                )
+        own = {
+            name: entry for name, entry in found.items() if name not in entries
+        }  # held out is what is not trained on
+        lists.append(list(own))
+        entries |= own
     return entries, (lists[0], lists[1]), None
 
 
@@ -135,7 +145,12 @@ def _listed(path: Path, content: dict[str, Any]) -> dict[str, Entry]:
         if not isinstance(frame, dict):
             raise UserError(f"{path}: frame {i} is no JSON object; expected file_path and transform_matrix")
         picture = _picture(path, value(path, frame, "file_path", str))
-        entries[_name(path.parent, picture)] = (path, shared | frame, picture)
+        name = _name(path.parent, picture)
+        if name in entries:
+            raise UserError(
+                f"{path}: frames {entries[name][2]} and {picture} are both '{name}'; expected names that differ"
+            )
+        entries[name] = (path, shared | frame, picture)
     return dict(sorted(entries.items()))
 
 
@@ -150,11 +165,10 @@ def _picture(path: Path, file: str) -> Path:
 
 
 def _name(folder: Path, picture: Path) -> str:
-    """A picture's path without its suffix, relative to `images` or to the scene."""
-    for root in (folder / "images", folder):
-        if picture.is_relative_to(root):
-            return picture.relative_to(root).with_suffix("").as_posix()
-    return picture.stem
+    """A picture's path without its suffix, relative to `images` or to the scene, never upwards."""
+    parts = Path(os.path.relpath(picture, folder)).with_suffix("").parts
+    within = parts[1:] if parts[0] == "images" else parts
+    return "/".join(part for part in within or parts if part != os.pardir)
 
 
 def _times(folder: Path, entries: dict[str, Entry]) -> dict[str, float]:
@@ -168,7 +182,7 @@ def _times(folder: Path, entries: dict[str, Entry]) -> dict[str, float]:
 def _pictures(folder: Path, files: dict[str, Path], downscale: int) -> dict[str, Picture]:
     """The frames' own files, or smaller copies of those in `images`."""
     root = folder / "images"
-    inside = [name for name, file in files.items() if file.is_relative_to(root)]
+    inside = [name for name, file in files.items() if Path(os.path.relpath(file, root)).parts[0] != os.pardir]
     plain = {name: Picture(file, 1) for name, file in files.items()}
     return plain | dict(zip(inside, copies(folder, root, downscale, inside) if inside else (), strict=True))
 
