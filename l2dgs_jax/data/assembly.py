@@ -145,10 +145,10 @@ def _read_split(folder: Path, part: str, frames: Sequence[Frame], width: int, he
 
     def read_frame(index: int) -> Float32[np.ndarray, "H W 3"]:
         frame = frames[index]
+        if frame.alpha == "coverage":
+            return fit(frame, frame.image.scale, images.read_over_black(frame.image.path))
         image, alpha = images.read_image_and_alpha(frame.image.path)
-        if alpha is not None and frame.alpha == "coverage":
-            image *= alpha
-        elif alpha is not None and frame.alpha == "validity":
+        if alpha is not None:
             # A pixel counts if nothing that it was made from is marked.
             counts = fit(frame, frame.image.scale, (alpha > 0.5).astype(np.float32))[..., 0] > 0.999
             if not counts.all():

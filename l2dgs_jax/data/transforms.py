@@ -140,7 +140,7 @@ def _entries(folder: Path) -> tuple[dict[str, Entry], Lists, str | None]:
 def _listed(path: Path, content: dict[str, Any]) -> dict[str, Entry]:
     """The frames of a file, with what it says of all of them, in the order of their names."""
     shared = {key: entry for key, entry in content.items() if key != "frames"}
-    entries = {}
+    entries: dict[str, Entry] = {}
     for i, frame in enumerate(value(path, content, "frames", list)):
         if not isinstance(frame, dict):
             raise UserError(f"{path}: frame {i} is no JSON object; expected file_path and transform_matrix")
