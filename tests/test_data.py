@@ -1,5 +1,6 @@
 import json
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -354,6 +355,57 @@ def test_covisible_masks(tmp_path):
     assert dataset.train.covisible is None
     assert dataset.test.covisible.dtype == bool
     np.testing.assert_array_equal(dataset.test.covisible, np.broadcast_to(mask > 0, (2, 12, 16)))
+
+
+def test_truth_and_masks_of_no_fitting_scale_are_mentioned(tmp_path):
+    scene = write_nerfies(tmp_path, truth=True)
+    for kind in ("well", "mask"):
+        (scene / kind / "1x").rename(scene / kind / "2x")
+        for path in (scene / kind / "2x").iterdir():
+            write_image(path, np.ones((12, 16, 3)))
+    (scene / "covisible").mkdir()
+    dataset = data.load(scene)
+    for split in (dataset.train, dataset.test):
+        assert (split.welllit, split.masks, split.covisible) == (None, None, None)
+    assert sorted(dataset.notes) == [
+        "covisible/ holds no folder like 1x: not used at --downscale 1",
+        "mask/ holds 2x: not used at --downscale 1",
+        "well/ holds 2x: not used at --downscale 1",
+    ]
+    assert data.load(scene, 2).train.masks.all()
+
+
+def test_masks_of_some_frames_only_are_mentioned(tmp_path):
+    scene = write_nerfies(tmp_path, truth=True)
+    (scene / "mask" / "1x" / "000003.png").unlink()
+    dataset = data.load(scene)
+    assert dataset.train.masks is None
+    assert dataset.test.masks is not None
+    assert dataset.notes == ("mask/1x/ has pictures of 5 of 6 frames, but not of '000003': not used",)
+
+
+def test_pictures_that_differ_in_their_suffix_only(tmp_path):
+    scene = write_nerfies(tmp_path / "scene", 9)
+    expected = data.load(scene)
+    for kind, layout in data.LAYOUTS.items():
+        layout.write(expected, tmp_path / kind)
+        root = tmp_path / kind / ("rgb/1x" if kind == "nerfies" else "images")
+        write_image(root / "000003.jpg", np.ones((24, 32, 3)))
+        if kind in ("colmap", "transforms"):  # these say which is meant
+            assert data.load(tmp_path / kind).train.images.max() < 0.5
+        else:
+            with pytest.raises(UserError, match=r"000003\.jpg: is 000003\.png under another suffix; expected one"):
+                data.load(tmp_path / kind)
+
+
+@pytest.mark.parametrize("call", ["iterdir", "is_dir"])
+def test_a_folder_that_cannot_be_listed(scene, monkeypatch, call):
+    def refuse(path, *_):
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr(Path, call, refuse)
+    with pytest.raises(UserError, match="scene.*: Permission denied; expected files that can be read"):
+        data.load(scene)
 
 
 def test_layouts_are_told_apart_and_can_be_named(tmp_path):

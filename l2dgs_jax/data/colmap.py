@@ -54,8 +54,9 @@ def read(folder: Path, downscale: int, held_out: str) -> Dataset:
     root = _root(folder, names)
 
     def frames(chosen: list[str]) -> list[Frame]:
+        pictures = copies(folder, root, downscale, {name: by_stem[name].name for name in chosen})
         described = []
-        for name, picture in zip(chosen, copies(folder, root, downscale, chosen), strict=True):
+        for name, picture in zip(chosen, pictures, strict=True):
             image = by_stem[name]
             if image.camera not in cameras:
                 raise UserError(f"{place}: '{image.name}' has camera {image.camera}; expected one that the model lists")

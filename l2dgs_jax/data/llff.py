@@ -59,7 +59,9 @@ def read(folder: Path, downscale: int, held_out: str) -> Dataset:
     def frames(chosen: list[str]) -> list[Frame]:
         return [
             Frame(name, f"{path}, row {names.index(name)}", *described[name], times[name], picture)
-            for name, picture in zip(chosen, copies(folder, root, downscale, chosen), strict=True)
+            for name, picture in zip(
+                chosen, copies(folder, root, downscale, {name: name for name in chosen}), strict=True
+            )
         ]
 
     model, cloud = colmap_model.find(folder), clouds.beside(folder)

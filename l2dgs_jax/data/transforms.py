@@ -182,7 +182,8 @@ def _times(folder: Path, entries: dict[str, Entry]) -> dict[str, float]:
 def _pictures(folder: Path, files: dict[str, Path], downscale: int) -> dict[str, Picture]:
     """The frames' own files, or smaller copies of those in `images`."""
     root = folder / "images"
-    inside = [name for name, file in files.items() if Path(os.path.relpath(file, root)).parts[0] != os.pardir]
+    within = {name: Path(os.path.relpath(file, root)) for name, file in files.items()}
+    inside = {name: path.as_posix() for name, path in within.items() if path.parts[0] != os.pardir}
     plain = {name: Picture(file, 1) for name, file in files.items()}
     return plain | dict(zip(inside, copies(folder, root, downscale, inside) if inside else (), strict=True))
 
