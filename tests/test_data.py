@@ -345,6 +345,19 @@ def test_pixels_of_alpha_0_do_not_count(tmp_path):
     np.testing.assert_allclose(dataset.train.images[third].astype(float), 128 / 255, atol=1e-3)
 
 
+@pytest.mark.parametrize("downscale", [1, 2])
+def test_pixels_that_the_lens_never_saw_do_not_count(tmp_path, downscale):
+    assert data.load(write_nerfies(tmp_path / "barrel", radial_distortion=[-0.2, 0, 0]), downscale).train.valid is None
+    scene = write_nerfies(tmp_path / "cushion", radial_distortion=[0.3, 0, 0])
+    x, y = (np.arange(32) + 0.5 - 16)[None] / 38.4, (np.arange(24) + 0.5 - 12)[:, None] / 38.4
+    factor = 1 + 0.3 * (x**2 + y**2)
+    inside = (np.abs(x * factor) <= 16 / 38.4) & (np.abs(y * factor) <= 12 / 38.4)
+    expected = inside.reshape(24 // downscale, downscale, 32 // downscale, downscale).all((1, 3))
+    assert 0 < expected.mean() < 1
+    for split in (data.load(scene, downscale).train, data.load(scene, downscale).test):
+        np.testing.assert_array_equal(split.valid, np.broadcast_to(expected, split.valid.shape))
+
+
 def test_covisible_masks(tmp_path):
     scene = write_nerfies(tmp_path)
     mask = np.zeros((12, 16))
@@ -404,7 +417,7 @@ def test_a_folder_that_cannot_be_listed(scene, monkeypatch, call):
         raise PermissionError(13, "Permission denied", str(path))
 
     monkeypatch.setattr(Path, call, refuse)
-    with pytest.raises(UserError, match="scene.*: Permission denied; expected files that can be read"):
+    with pytest.raises(UserError, match=r"scene.*: Permission denied; expected files that can be read"):
         data.load(scene)
 
 

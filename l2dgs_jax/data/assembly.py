@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Float16, Float32
 
 from l2dgs_jax.data import images
 from l2dgs_jax.data.dataset import Dataset, Original, Split
-from l2dgs_jax.data.lens import Lens, scale_intrinsics, undistort, without_skew
+from l2dgs_jax.data.lens import Lens, scale_intrinsics, seen, undistort, without_skew
 from l2dgs_jax.data.pictures import Picture, stored_if_any
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.types import Camera
@@ -131,8 +131,10 @@ def _read_split(
     notes: list[str] = []
 
     def fit(frame: Frame, scale: int, image: Float32[np.ndarray, "h w C"]) -> Float32[np.ndarray, "H W C"]:
-        straight = undistort(image, scale_intrinsics(frame.K, scale), frame.lens)
-        return images.area_average(straight, downscale // scale)[:height, :width]
+        return shrink(undistort(image, scale_intrinsics(frame.K, scale), frame.lens), scale)
+
+    def shrink(image: Float32[np.ndarray, "h w C"], scale: int) -> Float32[np.ndarray, "H W C"]:
+        return images.area_average(image, downscale // scale)[:height, :width]
 
     def read_all(root: Path, prefix: str = "", all_or_none: bool = False) -> Float16[np.ndarray, "F H W 3"] | None:
         found, note = stored_if_any(root, downscale, [prefix + name for name in names], all_or_none)
@@ -151,18 +153,24 @@ def _read_split(
 
     def read_frame(index: int) -> Float32[np.ndarray, "H W 3"]:
         frame = frames[index]
+        scale, alpha = frame.image.scale, None
         if frame.alpha == "coverage":
-            return fit(frame, frame.image.scale, images.read_over_black(frame.image.path))
-        image, alpha = images.read_image_and_alpha(frame.image.path)
+            image = images.read_over_black(frame.image.path)
+        else:
+            image, alpha = images.read_image_and_alpha(frame.image.path)
+        inside = seen((image.shape[1], image.shape[0]), scale_intrinsics(frame.K, scale), frame.lens)
+        # A pixel counts if all that it was made from does.
+        counts = all_count
+        if inside is not None:
+            counts = shrink(inside[..., None].astype(np.float32), scale)[..., 0] > 0.999
         if alpha is not None:
-            # A pixel counts if nothing that it was made from is marked.
-            counts = fit(frame, frame.image.scale, (alpha > 0.5).astype(np.float32))[..., 0] > 0.999
-            if not counts.all():
-                marked[index] = counts
-        return fit(frame, frame.image.scale, image)
+            counts = counts & (fit(frame, scale, (alpha > 0.5).astype(np.float32))[..., 0] > 0.999)
+        if not counts.all():
+            marked[index] = counts
+        return fit(frame, scale, image)
 
-    lowlight = _filled(read_frame, (len(frames), height, width, 3))
     all_count = np.ones((height, width), bool)
+    lowlight = _filled(read_frame, (len(frames), height, width, 3))
     K = [scale_intrinsics(without_skew(frame.K), downscale) for frame in frames]
     split = Split(
         names=tuple(names),
