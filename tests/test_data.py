@@ -181,6 +181,7 @@ def test_rule_for_clips_without_held_out_frames(tmp_path, num_frames):
     train = [i for i in range(num_frames) if i % 4 == 0]
     assert [int(name) for name in dataset.train.names] == train
     assert [int(name) for name in dataset.test.names] == [i + 2 for i in train][:-1]
+    assert dataset.notes == (f"{2 * len(train) - 1} of {num_frames} frames are used (held-out rule 4dgs)",)
 
 
 def test_split_files_stand_in_for_lists(scene):

@@ -49,7 +49,7 @@ def read(folder: Path, downscale: int, held_out: str) -> Dataset:
     if len(by_stem) < len(images):
         raise UserError(f"{place}: images of one name but different suffixes; expected names that differ before it")
     names = list(by_stem)
-    train, test = splits.choose(str(place), names, splits.lists_beside(folder, names), held_out, default="8")
+    train, test, notes = splits.choose(str(place), names, splits.lists_beside(folder, names), held_out, default="8")
     times = splits.instants(folder, names)
     root = _root(folder, names)
 
@@ -69,7 +69,8 @@ def read(folder: Path, downscale: int, held_out: str) -> Dataset:
         return described
 
     others = sorted(path.name for path in (folder / "sparse").iterdir() if path.is_dir() and path != place)
-    notes = (f"{place} is used; sparse/ also holds the models {', '.join(others)}",) if others else ()
+    if others:
+        notes = (*notes, f"{place} is used; sparse/ also holds the models {', '.join(others)}")
     return assemble(folder, frames(train), frames(test), points, colors, downscale, notes)
 
 

@@ -52,7 +52,7 @@ def read(folder: Path, downscale: int, held_out: str) -> Dataset:
     names = sorted(by_name(root))
     if len(names) != len(rows):
         raise UserError(f"{path}: has {len(rows)} poses for the {len(names)} pictures in {root}; expected one each")
-    train, test = splits.choose(str(path), names, splits.lists_beside(folder, names), held_out, default="8")
+    train, test, notes = splits.choose(str(path), names, splits.lists_beside(folder, names), held_out, default="8")
     times = splits.instants(folder, names)
     described = {name: _camera(f"{path}, row {i}", row) for i, (name, row) in enumerate(zip(names, rows, strict=True))}
 
@@ -65,13 +65,13 @@ def read(folder: Path, downscale: int, held_out: str) -> Dataset:
         ]
 
     model, cloud = colmap_model.find(folder), clouds.beside(folder)
-    notes: tuple[str, ...] = ()
     if cloud is None and model:
         cloud = colmap_model.read_points(model)  # in the same world, as the poses come from it
     if cloud is None:
         viewmats, Ks, _, sizes = zip(*described.values(), strict=True)
         cloud = clouds.in_frusta(np.stack(viewmats), np.stack(Ks), sizes[0], rows[:, 15:]), None
-        notes = (f"{folder} has no point cloud: {clouds.COUNT} random points between the bounds stand in for one",)
+        stand_in = f"{clouds.COUNT} random points between the bounds stand in for one"
+        notes = (*notes, f"{folder} has no point cloud: {stand_in}")
     return assemble(folder, frames(train), frames(test), *cloud, downscale, notes)
 
 

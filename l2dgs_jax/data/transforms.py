@@ -53,18 +53,16 @@ def read(folder: Path, downscale: int, held_out: str) -> Dataset:
     entries, own, ply = _entries(folder)
     names = list(entries)
     own = own if own[1] else splits.lists_beside(folder, names)
-    train, test = splits.choose(str(folder), names, own, held_out, default="8")
+    train, test, notes = splits.choose(str(folder), names, own, held_out, default="8")
     times = _times(folder, entries)
     pictures = _pictures(folder, {name: entries[name][2] for name in [*train, *test]}, downscale)
     frames = {name: _frame(name, *entries[name], times[name], picture) for name, picture in pictures.items()}
 
-    cloud = clouds.beside(
-        folder, ply
-    )  # a COLMAP model may be there too, but in another world: programs move and scale it
-    notes: tuple[str, ...] = ()
+    cloud = clouds.beside(folder, ply)  # not from sparse/: programs move and scale the world that COLMAP found
     if cloud is None:
         cloud = clouds.in_common_box(np.stack([frame.viewmat for frame in frames.values()]), str(folder)), None
-        notes = (f"{folder} has no point cloud: {clouds.COUNT} random points where its cameras look stand in for one",)
+        stand_in = f"{clouds.COUNT} random points where its cameras look stand in for one"
+        notes = (*notes, f"{folder} has no point cloud: {stand_in}")
     return assemble(folder, [frames[n] for n in train], [frames[n] for n in test], *cloud, downscale, notes)
 
 
