@@ -122,16 +122,13 @@ def _entries(folder: Path) -> tuple[dict[str, Entry], Lists, str | None]:
     for part in ("train", held_out):
         path = folder / f"transforms_{part}.json"
         found = _listed(path, read_json(path, "the frames")) if part else {}
-        for name in found.keys() & entries.keys():
-            if found[name][2] != entries[name][2]:
+        for name, (*_, picture) in found.items():
+            if name in entries and not entries[name][2].samefile(picture):
                 raise UserError(
-                    f"{path}: frame {found[name][2]} is '{name}' as {entries[name][2]} is; expected names that differ"
+                    f"{path}: frame {picture} is '{name}' as {entries[name][2]} is; expected names that differ"
                 )
-        own = {
-            name: entry for name, entry in found.items() if name not in entries
-        }  # held out is what is not trained on
-        lists.append(list(own))
-        entries |= own
+        lists.append([name for name in found if name not in entries])  # what is trained on is not held out as well
+        entries = {**entries, **found, **entries}
     return entries, (lists[0], lists[1]), None
 
 
