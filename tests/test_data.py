@@ -1,5 +1,6 @@
 import json
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -180,6 +181,7 @@ def test_rule_for_clips_without_held_out_frames(tmp_path, num_frames):
     train = [i for i in range(num_frames) if i % 4 == 0]
     assert [int(name) for name in dataset.train.names] == train
     assert [int(name) for name in dataset.test.names] == [i + 2 for i in train][:-1]
+    assert dataset.notes == (f"{2 * len(train) - 1} of {num_frames} frames are used (held-out rule 4dgs)",)
 
 
 def test_split_files_stand_in_for_lists(scene):
@@ -344,6 +346,19 @@ def test_pixels_of_alpha_0_do_not_count(tmp_path):
     np.testing.assert_allclose(dataset.train.images[third].astype(float), 128 / 255, atol=1e-3)
 
 
+@pytest.mark.parametrize("downscale", [1, 2])
+def test_pixels_that_the_lens_never_saw_do_not_count(tmp_path, downscale):
+    assert data.load(write_nerfies(tmp_path / "barrel", radial_distortion=[-0.2, 0, 0]), downscale).train.valid is None
+    scene = write_nerfies(tmp_path / "cushion", radial_distortion=[0.3, 0, 0])
+    x, y = (np.arange(32) + 0.5 - 16)[None] / 38.4, (np.arange(24) + 0.5 - 12)[:, None] / 38.4
+    factor = 1 + 0.3 * (x**2 + y**2)
+    inside = (np.abs(x * factor) <= 16 / 38.4) & (np.abs(y * factor) <= 12 / 38.4)
+    expected = inside.reshape(24 // downscale, downscale, 32 // downscale, downscale).all((1, 3))
+    assert 0 < expected.mean() < 1
+    for split in (data.load(scene, downscale).train, data.load(scene, downscale).test):
+        np.testing.assert_array_equal(split.valid, np.broadcast_to(expected, split.valid.shape))
+
+
 def test_covisible_masks(tmp_path):
     scene = write_nerfies(tmp_path)
     mask = np.zeros((12, 16))
@@ -354,6 +369,57 @@ def test_covisible_masks(tmp_path):
     assert dataset.train.covisible is None
     assert dataset.test.covisible.dtype == bool
     np.testing.assert_array_equal(dataset.test.covisible, np.broadcast_to(mask > 0, (2, 12, 16)))
+
+
+def test_truth_and_masks_of_no_fitting_scale_are_mentioned(tmp_path):
+    scene = write_nerfies(tmp_path, truth=True)
+    for kind in ("well", "mask"):
+        (scene / kind / "1x").rename(scene / kind / "2x")
+        for path in (scene / kind / "2x").iterdir():
+            write_image(path, np.ones((12, 16, 3)))
+    (scene / "covisible").mkdir()
+    dataset = data.load(scene)
+    for split in (dataset.train, dataset.test):
+        assert (split.welllit, split.masks, split.covisible) == (None, None, None)
+    assert sorted(dataset.notes) == [
+        "covisible/ holds no folder like 1x: not used at --downscale 1",
+        "mask/ holds 2x: not used at --downscale 1",
+        "well/ holds 2x: not used at --downscale 1",
+    ]
+    assert data.load(scene, 2).train.masks.all()
+
+
+def test_masks_of_some_frames_only_are_mentioned(tmp_path):
+    scene = write_nerfies(tmp_path, truth=True)
+    (scene / "mask" / "1x" / "000003.png").unlink()
+    dataset = data.load(scene)
+    assert dataset.train.masks is None
+    assert dataset.test.masks is not None
+    assert dataset.notes == ("mask/1x/ has pictures of 5 of 6 frames, but not of '000003': not used",)
+
+
+def test_pictures_that_differ_in_their_suffix_only(tmp_path):
+    scene = write_nerfies(tmp_path / "scene", 9)
+    expected = data.load(scene)
+    for kind, layout in data.LAYOUTS.items():
+        layout.write(expected, tmp_path / kind)
+        root = tmp_path / kind / ("rgb/1x" if kind == "nerfies" else "images")
+        write_image(root / "000003.jpg", np.ones((24, 32, 3)))
+        if kind in ("colmap", "transforms"):  # these say which is meant
+            assert data.load(tmp_path / kind).train.images.max() < 0.5
+        else:
+            with pytest.raises(UserError, match=r"000003\.jpg: is 000003\.png under another suffix; expected one"):
+                data.load(tmp_path / kind)
+
+
+@pytest.mark.parametrize("call", ["iterdir", "is_dir"])
+def test_a_folder_that_cannot_be_listed(scene, monkeypatch, call):
+    def refuse(path, *_):
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr(Path, call, refuse)
+    with pytest.raises(UserError, match=r"scene.*: Permission denied; expected files that can be read"):
+        data.load(scene)
 
 
 def test_layouts_are_told_apart_and_can_be_named(tmp_path):

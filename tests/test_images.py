@@ -99,6 +99,21 @@ def test_grey_and_alpha(tmp_path):
             np.testing.assert_allclose(alpha, pixels[..., 3:] / 255, atol=1e-6)
 
 
+def test_alpha_is_taken_out_of_colours_that_hold_it(tmp_path):
+    pixels = np.zeros((1, 3, 4), np.float32)
+    pixels[0] = [[0.25, 0.25, 0.25, 0.5], [0.25, 0.25, 0.25, 0], [0.25, 0.25, 0.25, 1]]
+    write(tmp_path / "held.exr", pixels)
+    write(tmp_path / "held.tif", pixels, **{"oiio:ColorSpace": "sRGB"})
+    write(tmp_path / "beside.tif", pixels, **{"oiio:ColorSpace": "sRGB", "oiio:UnassociatedAlpha": 1})
+    for name, alone, over_black in (
+        ("held.exr", [0.73536, 0.53710, 0.53710], [0.53710, 0.53710, 0.53710]),  # the middle one glows
+        ("held.tif", [0.5, 0.25, 0.25], [0.25, 0.25, 0.25]),
+        ("beside.tif", [0.25, 0.25, 0.25], [0.125, 0, 0.25]),
+    ):
+        np.testing.assert_allclose(images.read_image(tmp_path / name)[0, :, 0], alone, atol=1e-4)
+        np.testing.assert_allclose(images.read_over_black(tmp_path / name)[0, :, 0], over_black, atol=1e-4)
+
+
 def test_alpha_is_written_beside_the_colour(tmp_path):
     pixels = np.random.default_rng(0).integers(0, 256, (5, 6, 4), np.uint8)
     pixels[0, :, 3] = 0

@@ -12,13 +12,14 @@ NAMES = [f"{i:02d}" for i in range(17)]
 
 def test_rules():
     rule = lambda name: splits.choose("x", NAMES, splits.NO_LISTS, name, "8")
-    assert rule("auto") == rule("8") == ([n for i, n in enumerate(NAMES) if i % 8], ["00", "08", "16"])
-    assert rule("4dgs") == (["00", "04", "08", "12", "16"], ["02", "06", "10", "14"])
+    assert rule("auto") == rule("8") == ([n for i, n in enumerate(NAMES) if i % 8], ["00", "08", "16"], ())
+    note = "9 of 17 frames are used (held-out rule 4dgs)"
+    assert rule("4dgs") == (["00", "04", "08", "12", "16"], ["02", "06", "10", "14"], (note,))
 
 
 def test_the_scenes_own_lists_come_first_unless_a_rule_is_asked_for():
     own = (["03", "01"], ["02"])
-    assert splits.choose("x", NAMES, own, "auto", "8") == own
+    assert splits.choose("x", NAMES, own, "auto", "8") == (*own, ())
     assert splits.choose("x", NAMES, own, "9", "8")[1] == ["00", "09"]
 
 

@@ -1,13 +1,14 @@
 """Scenes of Blender, D-NeRF, instant-ngp and nerfstudio."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from scenes import edit_json, write_image, write_json, write_nerfies
 
 from l2dgs_jax import data
-from l2dgs_jax.data import clouds, transforms
+from l2dgs_jax.data import clouds, colmap, transforms
 from l2dgs_jax.errors import UserError
 
 
@@ -95,6 +96,16 @@ def test_points_beside_the_scene_are_found(blender):
     assert dataset.notes == ()
 
 
+def test_a_colmap_model_beside_it_is_of_another_world(studio, tmp_path):
+    colmap.write(data.load(tmp_path / "nerfies"), tmp_path / "colmap")
+    (tmp_path / "colmap" / "sparse").rename(studio / "sparse")
+    (studio / "points3D.ply").unlink()
+    edit_json(studio / "transforms.json", ply_file_path=None)
+    dataset = data.load(studio, format="transforms")
+    assert len(dataset.points) == clouds.COUNT
+    assert "no point cloud" in dataset.notes[0]
+
+
 def test_val_stands_in_for_test_and_a_rule_for_both(blender):
     (blender / "transforms_test.json").unlink()
     assert data.load(blender).test.names == ("val/r_000", "val/r_001")
@@ -136,6 +147,38 @@ def test_fisheye(studio):
     fisheye = data.load(studio).train.images
     edit_json(studio / "transforms.json", camera_model="OPENCV")
     assert np.any(data.load(studio).train.images != fisheye)
+
+
+def test_pictures_outside_the_scene_have_names_that_stay_inside(studio, tmp_path):
+    expected = data.load(studio)
+    (studio / "images").rename(tmp_path / "frames")
+    (studio / "images").mkdir()
+    frames = json.loads((studio / "transforms.json").read_text())["frames"]
+    for i, frame in enumerate(frames):
+        place = ("../frames", tmp_path / "frames", "images/../../frames")[i % 3]
+        frame["file_path"] = frame["file_path"].replace("images", str(place))
+    edit_json(studio / "transforms.json", frames=frames)
+    dataset = data.load(studio)
+    assert dataset.train.names == tuple(f"frames/{name}" for name in expected.train.names)
+    assert np.array_equal(dataset.train.images, expected.train.images)
+    transforms.write(dataset, tmp_path / "written" / "scene")
+    assert [path.name for path in (tmp_path / "written").iterdir()] == ["scene"]
+    escaping = replace(dataset, train=replace(dataset.train, names=("../x", *dataset.train.names[1:])))
+    with pytest.raises(UserError, match=r"frame '../x': .* expected"):
+        transforms.write(escaping, tmp_path / "escaped")
+    assert not (tmp_path / "escaped").exists()
+
+
+def test_frames_of_one_name_are_refused(blender):
+    write_image(blender / "train" / "r_001.jpg", np.zeros((12, 16, 3)))
+    for listed, message in (("train", "frames .* and .* are both"), ("test", "frame .* is 'train/r_001' as")):
+        path = blender / f"transforms_{listed}.json"
+        content = json.loads(path.read_text())
+        again = {**content["frames"][0], "file_path": "train/r_001.jpg"}
+        edit_json(path, frames=[*content["frames"], again])
+        with pytest.raises(UserError, match=rf"{listed}\.json: {message}.*; expected names that differ"):
+            data.load(blender)
+        write_json(path, content)
 
 
 def change(**changes):

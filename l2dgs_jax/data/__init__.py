@@ -30,15 +30,15 @@ def load(scene: str | Path, downscale: int = 1, format: str = "auto", held_out: 
         raise UserError(f"--downscale {downscale}: expected a whole number from 1")
     splits.check_rule(held_out)
     folder = demo.FOLDER if scene == "demo" else Path(scene)
-    if folder.is_file() and zipfile.is_zipfile(folder):
-        raise UserError(f"{folder}: is a zip archive; expected a folder: unpack it first")
-    if not folder.is_dir():
-        raise UserError(f"{folder}: no such folder; expected a scene's folder, or 'demo'")
-    if format == "auto":
-        format = _recognized(folder)
-    elif format not in LAYOUTS:
+    if format not in ("auto", *LAYOUTS):
         raise UserError(f"--format {format}: no such layout; expected auto, {', '.join(LAYOUTS)}")
     try:
+        if folder.is_file() and zipfile.is_zipfile(folder):
+            raise UserError(f"{folder}: is a zip archive; expected a folder: unpack it first")
+        if not folder.is_dir():
+            raise UserError(f"{folder}: no such folder; expected a scene's folder, or 'demo'")
+        if format == "auto":
+            format = _recognized(folder)
         with np.errstate(all="ignore"):  # `assemble` complains of what has overflown
             return LAYOUTS[format].read(folder, downscale, held_out)
     except OSError as error:

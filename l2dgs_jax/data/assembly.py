@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Float16, Float32
 
 from l2dgs_jax.data import images
 from l2dgs_jax.data.dataset import Dataset, Original, Split
-from l2dgs_jax.data.lens import Lens, scale_intrinsics, undistort, without_skew
+from l2dgs_jax.data.lens import Lens, scale_intrinsics, seen, undistort, without_skew
 from l2dgs_jax.data.pictures import Picture, stored_if_any
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.types import Camera
@@ -85,15 +85,17 @@ def assemble(
     if _check_pictures([frame.image for frame in frames], full):
         notes = (*notes, LINEAR_NOTE)
     width, height = full[0] // downscale, full[1] // downscale
+    learned, train_notes = _read_split(folder, "train", train, width, height, downscale)
+    held_out, test_notes = _read_split(folder, "val", test, width, height, downscale)
     return Dataset(
         name=folder.resolve().name,
         width=width,
         height=height,
-        train=_read_split(folder, "train", train, width, height, downscale),
-        test=_read_split(folder, "val", test, width, height, downscale),
+        train=learned,
+        test=held_out,
         points=_single(points, f"{folder}: a point"),
         colors=colors,
-        notes=notes,
+        notes=tuple(dict.fromkeys((*notes, *train_notes, *test_notes))),
     )
 
 
@@ -121,17 +123,23 @@ def _check_pictures(pictures: Sequence[Picture], full: tuple[int, int]) -> bool:
     return any(header.linear for header in headers)
 
 
-def _read_split(folder: Path, part: str, frames: Sequence[Frame], width: int, height: int, downscale: int) -> Split:
-    """Read the pictures of one split; truth and masks that no frame has are None."""
+def _read_split(
+    folder: Path, part: str, frames: Sequence[Frame], width: int, height: int, downscale: int
+) -> tuple[Split, list[str]]:
+    """Read the pictures of one split, with notes; truth and masks that no frame has are None."""
     names = [frame.name for frame in frames]
+    notes: list[str] = []
 
     def fit(frame: Frame, scale: int, image: Float32[np.ndarray, "h w C"]) -> Float32[np.ndarray, "H W C"]:
-        straight = undistort(image, scale_intrinsics(frame.K, scale), frame.lens)
-        return images.area_average(straight, downscale // scale)[:height, :width]
+        return shrink(undistort(image, scale_intrinsics(frame.K, scale), frame.lens), scale)
 
-    def read_all(root: Path, prefix: str = "") -> Float16[np.ndarray, "F H W 3"] | None:
-        pictures = stored_if_any(root, downscale, [prefix + name for name in names])
-        found = [picture for picture in pictures if picture]
+    def shrink(image: Float32[np.ndarray, "h w C"], scale: int) -> Float32[np.ndarray, "H W C"]:
+        return images.area_average(image, downscale // scale)[:height, :width]
+
+    def read_all(root: Path, prefix: str = "", all_or_none: bool = False) -> Float16[np.ndarray, "F H W 3"] | None:
+        found, note = stored_if_any(root, downscale, [prefix + name for name in names], all_or_none)
+        if note:
+            notes.append(note)
         if not found:
             return None
         _check_pictures(found, frames[0].size)
@@ -145,20 +153,26 @@ def _read_split(folder: Path, part: str, frames: Sequence[Frame], width: int, he
 
     def read_frame(index: int) -> Float32[np.ndarray, "H W 3"]:
         frame = frames[index]
-        image, alpha = images.read_image_and_alpha(frame.image.path)
-        if alpha is not None and frame.alpha == "coverage":
-            image *= alpha
-        elif alpha is not None and frame.alpha == "validity":
-            # A pixel counts if nothing that it was made from is marked.
-            counts = fit(frame, frame.image.scale, (alpha > 0.5).astype(np.float32))[..., 0] > 0.999
-            if not counts.all():
-                marked[index] = counts
-        return fit(frame, frame.image.scale, image)
+        scale, alpha = frame.image.scale, None
+        if frame.alpha == "coverage":
+            image = images.read_over_black(frame.image.path)
+        else:
+            image, alpha = images.read_image_and_alpha(frame.image.path)
+        inside = seen((image.shape[1], image.shape[0]), scale_intrinsics(frame.K, scale), frame.lens)
+        # A pixel counts if all that it was made from does.
+        counts = all_count
+        if inside is not None:
+            counts = shrink(inside[..., None].astype(np.float32), scale)[..., 0] > 0.999
+        if alpha is not None:
+            counts = counts & (fit(frame, scale, (alpha > 0.5).astype(np.float32))[..., 0] > 0.999)
+        if not counts.all():
+            marked[index] = counts
+        return fit(frame, scale, image)
 
-    lowlight = _filled(read_frame, (len(frames), height, width, 3))
     all_count = np.ones((height, width), bool)
+    lowlight = _filled(read_frame, (len(frames), height, width, 3))
     K = [scale_intrinsics(without_skew(frame.K), downscale) for frame in frames]
-    return Split(
+    split = Split(
         names=tuple(names),
         cameras=Camera(
             viewmat=_stacked([frame.viewmat for frame in frames], frames),
@@ -166,12 +180,13 @@ def _read_split(folder: Path, part: str, frames: Sequence[Frame], width: int, he
             time=_stacked([np.array(frame.time) for frame in frames], frames),
         ),
         images=lowlight,
-        welllit=read_all(folder / "well"),
+        welllit=read_all(folder / "well", all_or_none=True),
         masks=majority(read_all(folder / "mask")),
         valid=np.stack([marked.get(i, all_count) for i in range(len(frames))]) if marked else None,
         covisible=majority(read_all(folder / "covisible", f"{part}/")),
         originals=tuple(Original(frame.size, frame.K, frame.lens) for frame in frames),
     )
+    return split, notes
 
 
 def _filled(

@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Float32, Float64, Shaped
 
-from l2dgs_jax.data import colmap_model
 from l2dgs_jax.errors import UserError
 
 COUNT = 10_000  # points of a random cloud
@@ -23,7 +22,7 @@ _ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 
 def beside(folder: Path, named: str | None = None) -> Cloud | None:
-    """The cloud in a file of the scene: the one it names, else one of `FILES`, else that of a COLMAP model.
+    """The cloud in a PLY file of the scene: the one it names, else one of `FILES`.
 
     Raises:
         UserError: the file is missing or damaged.
@@ -31,8 +30,7 @@ def beside(folder: Path, named: str | None = None) -> Cloud | None:
     for path in (folder / named,) if named else (folder / name for name in FILES):
         if named or path.is_file():
             return read_ply(path)
-    model = colmap_model.find(folder)
-    return colmap_model.read_points(model) if model else None
+    return None
 
 
 def in_common_box(viewmats: Float64[np.ndarray, "F 4 4"], source: str) -> Float64[np.ndarray, "P 3"]:

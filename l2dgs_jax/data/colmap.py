@@ -49,13 +49,14 @@ def read(folder: Path, downscale: int, held_out: str) -> Dataset:
     if len(by_stem) < len(images):
         raise UserError(f"{place}: images of one name but different suffixes; expected names that differ before it")
     names = list(by_stem)
-    train, test = splits.choose(str(place), names, splits.lists_beside(folder, names), held_out, default="8")
+    train, test, notes = splits.choose(str(place), names, splits.lists_beside(folder, names), held_out, default="8")
     times = splits.instants(folder, names)
     root = _root(folder, names)
 
     def frames(chosen: list[str]) -> list[Frame]:
+        pictures = copies(folder, root, downscale, {name: by_stem[name].name for name in chosen})
         described = []
-        for name, picture in zip(chosen, copies(folder, root, downscale, chosen), strict=True):
+        for name, picture in zip(chosen, pictures, strict=True):
             image = by_stem[name]
             if image.camera not in cameras:
                 raise UserError(f"{place}: '{image.name}' has camera {image.camera}; expected one that the model lists")
@@ -68,7 +69,8 @@ def read(folder: Path, downscale: int, held_out: str) -> Dataset:
         return described
 
     others = sorted(path.name for path in (folder / "sparse").iterdir() if path.is_dir() and path != place)
-    notes = (f"{place} is used; sparse/ also holds the models {', '.join(others)}",) if others else ()
+    if others:
+        notes = (*notes, f"{place} is used; sparse/ also holds the models {', '.join(others)}")
     return assemble(folder, frames(train), frames(test), points, colors, downscale, notes)
 
 

@@ -32,7 +32,7 @@ class Header(NamedTuple):
 
 
 def read_image(path: Path) -> Float32[np.ndarray, "H W 3"]:
-    """Read a picture, grey or colour, upright; alpha is dropped, not multiplied in.
+    """Read a picture, grey or colour, upright; alpha is dropped, and where colours are multiplied by it, divided out.
 
     Integers of any depth are sRGB values, as cameras write them. Floating-point values (EXR, Radiance HDR, TIFF) are
     linear light unless the file says otherwise: they are clipped to [0, 1] and converted.
@@ -45,20 +45,42 @@ def read_image(path: Path) -> Float32[np.ndarray, "H W 3"]:
 
 def read_image_and_alpha(path: Path) -> tuple[Float32[np.ndarray, "H W 3"], Float32[np.ndarray, "H W 1"] | None]:
     """Like `read_image`, with the alpha channel if there is one."""
+    color, alpha, associated, linear = _read(path)
+    if alpha is not None and associated:
+        color = np.divide(color, alpha, out=color.copy(), where=alpha > 0)
+    return _displayed(color, linear), alpha
+
+
+def read_over_black(path: Path) -> Float32[np.ndarray, "H W 3"]:
+    """Like `read_image`, but composited over black, in the values that the file holds."""
+    color, alpha, associated, linear = _read(path)
+    return _displayed(color if alpha is None or associated else color * alpha, linear)
+
+
+def _read(path: Path) -> tuple[Float32[np.ndarray, "H W 3"], Float32[np.ndarray, "H W 1"] | None, bool, bool]:
+    """Colour as stored and alpha, whether the one is multiplied by the other, and whether it is linear light."""
     with closing(_open(path)) as file:
         spec = file.spec()
         pixels = file.read_image(oiio.FLOAT)
         if pixels is None:
             raise UserError(f"{path}: expected a readable picture, but it is damaged ({_reason(file.geterror())})")
+        may_be_associated = file.format_name() in ("openexr", "tiff")
     pixels = _upright(np.asarray(pixels, np.float32), _orientation(spec))
     if _is_float(spec) and not np.isfinite(pixels).all():
         raise UserError(f"{path}: holds NaN or infinite values; expected finite colours")
     color = pixels[..., :3] if pixels.shape[-1] >= 3 else np.repeat(pixels[..., :1], 3, axis=-1)
-    color, alpha = np.ascontiguousarray(color), spec.alpha_channel
+    channel = spec.alpha_channel
     return (
-        linear_to_srgb(np.clip(color, 0, 1)) if _is_linear(spec) else color,
-        None if alpha < 0 else np.ascontiguousarray(pixels[..., alpha : alpha + 1]),
+        np.ascontiguousarray(color),
+        None if channel < 0 else np.ascontiguousarray(pixels[..., channel : channel + 1]),
+        may_be_associated and not spec.getattribute("oiio:UnassociatedAlpha"),
+        _is_linear(spec),
     )
+
+
+def _displayed(color: Float32[np.ndarray, "H W 3"], linear: bool) -> Float32[np.ndarray, "H W 3"]:
+    """Stored colour as sRGB values."""
+    return linear_to_srgb(np.clip(color, 0, 1)) if linear else color
 
 
 def read_header(path: Path) -> Header:
@@ -107,7 +129,8 @@ def area_average(image: Float32[np.ndarray, "H W C"], factor: int) -> Float32[np
 def _open(path: Path) -> oiio.ImageInput:
     if not os.path.isfile(path):
         raise UserError(f"{path}: no such file; expected a picture")
-    # Without this hint OpenImageIO multiplies colours by alpha, and pixels of alpha 0 turn black.
+    # Without this hint OpenImageIO multiplies colours by alpha, and pixels of alpha 0 turn black. What is multiplied
+    # in the file (EXR, some TIFF) stays so all the same.
     keep = oiio.ImageSpec()
     keep.attribute("oiio:UnassociatedAlpha", 1)
     file = oiio.ImageInput.open(str(path), keep)

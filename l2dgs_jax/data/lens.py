@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float32, Shaped
+from jaxtyping import Bool, Float, Float32, Shaped
 
 
 class Lens(NamedTuple):
@@ -69,6 +69,19 @@ def undistort(
     return np.clip(warped.reshape(image.shape), 0, 1)  # cubic interpolation overshoots
 
 
+def seen(size: tuple[int, int], K: Float[np.ndarray, "3 3"], lens: Lens) -> Bool[np.ndarray, "H W"] | None:
+    """Where `undistort` returns what the lens saw; None if everywhere.
+
+    Args:
+        size: width and height in pixels.
+        K: intrinsics of a picture of this size, skew included.
+        lens: its distortion.
+    """
+    if lens.is_pinhole and K[0, 1] == 0:
+        return None
+    return _seen(*size, tuple(K[:2].ravel().tolist()), lens)
+
+
 def distorted(image: Shaped[np.ndarray, "H W"], K: Float[np.ndarray, "3 3"], lens: Lens) -> Shaped[np.ndarray, "H W"]:
     """What the lens would have imaged of a straight picture: `undistort` the other way round, nearest pixels.
 
@@ -105,14 +118,29 @@ def _polynomial(coefficients: tuple[float, ...], s: Float[np.ndarray, "*S"]) -> 
 def _places(
     width: int, height: int, K: tuple[float, ...], lens: Lens
 ) -> tuple[Float32[np.ndarray, "H W"], Float32[np.ndarray, "H W"]]:
+    """What to ask cv2's cubic interpolation for to get the pixels of the straight picture from the distorted one."""
+    columns, rows = _bent(width, height, K, lens)
+    return _for_cubic(columns, width), _for_cubic(rows, height)
+
+
+@functools.lru_cache(maxsize=4)
+def _seen(width: int, height: int, K: tuple[float, ...], lens: Lens) -> Bool[np.ndarray, "H W"] | None:
+    columns, rows = _bent(width, height, K, lens)
+    # Up to the edges of the outermost pixels; false for NaN.
+    inside = (columns >= -0.5) & (columns <= width - 0.5) & (rows >= -0.5) & (rows <= height - 0.5)
+    return None if inside.all() else inside
+
+
+def _bent(
+    width: int, height: int, K: tuple[float, ...], lens: Lens
+) -> tuple[Float32[np.ndarray, "H W"], Float32[np.ndarray, "H W"]]:
     """Column and row of the distorted picture, centres counted from 0, that each pixel of the straight one shows."""
     fx, skew, cx, _, fy, cy = K
     x = ((np.arange(width) + 0.5 - cx)[None, :] / fx).astype(np.float32)  # to a thousandth of a pixel; twice as fast
     y = ((np.arange(height) + 0.5 - cy)[:, None] / fy).astype(np.float32)
     with np.errstate(all="ignore"):  # a nonsensical lens leads out of the picture
         lens_x, lens_y = distort(lens, *np.broadcast_arrays(x, y))
-        columns, rows = fx * lens_x + skew * lens_y + cx - 0.5, fy * lens_y + cy - 0.5
-    return _for_cubic(columns, width), _for_cubic(rows, height)
+        return fx * lens_x + skew * lens_y + cx - 0.5, fy * lens_y + cy - 0.5
 
 
 @functools.lru_cache(maxsize=4)

@@ -2,7 +2,8 @@
 
     poses_bounds.npy   [F, 17]: pose [3, 5] (axes down, right, back; position; height, width, focal length), near, far
     images/<name>, in the order of their names   [images_<k>/<name>, k times smaller]
-    [a point cloud, see `clouds.beside`]   [dataset.json]   [metadata.json]   as Nerfies has them
+    [a point cloud, see `clouds.beside`, else sparse/ as COLMAP has it]
+    [dataset.json]   [metadata.json]   as Nerfies has them
 
 Alpha 0 marks pixels that do not count.
 """
@@ -51,22 +52,26 @@ def read(folder: Path, downscale: int, held_out: str) -> Dataset:
     names = sorted(by_name(root))
     if len(names) != len(rows):
         raise UserError(f"{path}: has {len(rows)} poses for the {len(names)} pictures in {root}; expected one each")
-    train, test = splits.choose(str(path), names, splits.lists_beside(folder, names), held_out, default="8")
+    train, test, notes = splits.choose(str(path), names, splits.lists_beside(folder, names), held_out, default="8")
     times = splits.instants(folder, names)
     described = {name: _camera(f"{path}, row {i}", row) for i, (name, row) in enumerate(zip(names, rows, strict=True))}
 
     def frames(chosen: list[str]) -> list[Frame]:
         return [
             Frame(name, f"{path}, row {names.index(name)}", *described[name], times[name], picture)
-            for name, picture in zip(chosen, copies(folder, root, downscale, chosen), strict=True)
+            for name, picture in zip(
+                chosen, copies(folder, root, downscale, {name: name for name in chosen}), strict=True
+            )
         ]
 
-    cloud = clouds.beside(folder)
-    notes: tuple[str, ...] = ()
+    model, cloud = colmap_model.find(folder), clouds.beside(folder)
+    if cloud is None and model:
+        cloud = colmap_model.read_points(model)  # in the same world, as the poses come from it
     if cloud is None:
         viewmats, Ks, _, sizes = zip(*described.values(), strict=True)
         cloud = clouds.in_frusta(np.stack(viewmats), np.stack(Ks), sizes[0], rows[:, 15:]), None
-        notes = (f"{folder} has no point cloud: {clouds.COUNT} random points between the bounds stand in for one",)
+        stand_in = f"{clouds.COUNT} random points between the bounds stand in for one"
+        notes = (*notes, f"{folder} has no point cloud: {stand_in}")
     return assemble(folder, frames(train), frames(test), *cloud, downscale, notes)
 
 

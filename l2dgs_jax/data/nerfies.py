@@ -41,7 +41,7 @@ def read(folder: Path, downscale: int, held_out: str) -> Dataset:
         UserError: a file is missing, malformed or inconsistent.
     """
     listed, own = splits.lists(folder)
-    train, val = splits.choose(f"{folder / 'dataset.json'}", listed, own, held_out, default="4dgs")
+    train, val, notes = splits.choose(f"{folder / 'dataset.json'}", listed, own, held_out, default="4dgs")
     times = splits.instants(folder, listed)
     center, scale = _normalization(folder)
     points, colors = _points(folder)
@@ -54,7 +54,7 @@ def read(folder: Path, downscale: int, held_out: str) -> Dataset:
         ]
 
     world = (points - center) * scale
-    return assemble(folder, frames(train), frames(val), world, colors, downscale)
+    return assemble(folder, frames(train), frames(val), world, colors, downscale, notes)
 
 
 def _normalization(folder: Path) -> tuple[Float64[np.ndarray, "3"], float]:

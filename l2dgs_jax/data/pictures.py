@@ -1,7 +1,7 @@
 """Which files hold the pictures of a scene's frames."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -29,53 +29,91 @@ def stored(root: Path, downscale: int, names: Sequence[str]) -> list[Picture]:
     missing = [name for name in names if name not in files]
     if missing:
         raise UserError(f"{folder / missing[0]}.png: no such file; expected the picture of frame '{missing[0]}'")
-    return [Picture(files[name], scale) for name in names]
+    return [Picture(_only(files[name]), scale) for name in names]
 
 
-def stored_if_any(root: Path, downscale: int, names: Sequence[str]) -> list[Picture] | list[None]:
-    """Like `stored`, but None for every frame if none of them has a picture.
+def stored_if_any(root: Path, downscale: int, names: Sequence[str], all_or_none: bool) -> tuple[list[Picture], str]:
+    """Like `stored`, but no pictures at all if none can be used, and a note if there are some nonetheless.
+
+    Args:
+        root: which folder holds `<k>x/<name>.<suffix>`.
+        downscale: what k must divide.
+        names: of the frames.
+        all_or_none: whether pictures of some frames only are an error, and not just of no use.
 
     Raises:
-        UserError: some frames have a picture and some do not.
+        UserError: `all_or_none`, and some frames have a picture and some do not.
     """
-    if not root.is_dir() or not by_name(_coarsest(root, downscale)[0]).keys() & set(names):
-        return [None] * len(names)
-    return stored(root, downscale, names)
+    if not root.is_dir():
+        return [], ""
+    held, scale = _scales(root, downscale)
+    if not scale:
+        return [], f"{root.name}/ holds {held}: not used at --downscale {downscale}"
+    has = by_name(root / f"{scale}x").keys() & set(names)
+    if len(has) == len(names) or (has and all_or_none):
+        return stored(root, downscale, names), ""
+    missing = next(name for name in names if name not in has)
+    some = f"{root.name}/{scale}x/ has pictures of {len(has)} of {len(names)} frames, but not of '{missing}': not used"
+    return [], some if has else ""
 
 
-def copies(scene: Path, root: Path, downscale: int, names: Sequence[str]) -> list[Picture]:
+def copies(scene: Path, root: Path, downscale: int, files: Mapping[str, str]) -> list[Picture]:
     """Each frame's picture in `root`, or in `<root>_<k>` beside it for the largest such k that divides `downscale`.
 
     Only folders within the `scene`'s are looked at.
 
+    Args:
+        scene: the scene's folder.
+        root: the folder of the pictures in full size.
+        downscale: what k must divide.
+        files: by frames' names, without a suffix, the paths within `root` of the files that are meant; files of
+            another suffix stand in for those that are not there.
+
     Raises:
-        UserError: pictures of frames are missing.
+        UserError: pictures of frames are missing, or it is not clear which is meant.
     """
     factors = [k for k in range(downscale, 1, -1) if downscale % k == 0 and root != scene]
     scale = next((k for k in factors if root.with_name(f"{root.name}_{k}").is_dir()), 1)
     folder = root if scale == 1 else root.with_name(f"{root.name}_{scale}")
-    files = by_name(folder)
-    missing = [name for name in names if name not in files]
+    found = by_name(folder)
+    missing = [name for name in files if name not in found]
     if missing:
         raise UserError(
-            f"{folder}: holds {len(files)} pictures, but none of {len(missing)} of the {len(names)} frames, such as "
+            f"{folder}: holds {len(found)} pictures, but none of {len(missing)} of the {len(files)} frames, such as "
             f"'{missing[0]}'; expected every frame's"
         )
-    return [Picture(files[name], scale) for name in names]
+    return [Picture(_only(found[name], folder / file), scale) for name, file in files.items()]
 
 
-def by_name(folder: Path) -> dict[str, Path]:
+def by_name(folder: Path) -> dict[str, list[Path]]:
     """Picture files by their path within the folder, without the suffix."""
-    files = (path for path in sorted(folder.rglob("*")) if path.suffix.lower() in SUFFIXES)
-    return {path.relative_to(folder).with_suffix("").as_posix(): path for path in files}
+    files: dict[str, list[Path]] = {}
+    for path in sorted(folder.rglob("*")):
+        if path.suffix.lower() in SUFFIXES:
+            files.setdefault(path.relative_to(folder).with_suffix("").as_posix(), []).append(path)
+    return files
+
+
+def _only(files: Sequence[Path], meant: Path | None = None) -> Path:
+    """The one of several pictures of a name that is meant, or the only one."""
+    if meant and meant in files:
+        return meant
+    if len(files) > 1:
+        raise UserError(f"{files[0]}: is {files[1].name} under another suffix; expected one picture for each frame")
+    return files[0]
 
 
 def _coarsest(root: Path, downscale: int) -> tuple[Path, int]:
     if not root.is_dir():
         raise UserError(f"{root}: no such folder; expected pictures in {root / '1x'}")
-    held = [int(match[1]) for path in sorted(root.iterdir()) if (match := _SCALE.fullmatch(path.name))]
-    scale = max((factor for factor in held if downscale % factor == 0), default=0)
+    held, scale = _scales(root, downscale)
     if not scale:
-        found = ", ".join(f"{factor}x" for factor in held) or "no folder like 1x"
-        raise UserError(f"{root}: holds {found}; expected a factor that divides --downscale {downscale}")
+        raise UserError(f"{root}: holds {held}; expected a factor that divides --downscale {downscale}")
     return root / f"{scale}x", scale
+
+
+def _scales(root: Path, downscale: int) -> tuple[str, int]:
+    """The factors k of the folders `<k>x`, in words, and the largest of them that divides `downscale`, else 0."""
+    held = sorted(int(match[1]) for path in root.iterdir() if (match := _SCALE.fullmatch(path.name)))
+    largest = max((factor for factor in held if downscale % factor == 0), default=0)
+    return ", ".join(f"{factor}x" for factor in held) or "no folder like 1x", largest

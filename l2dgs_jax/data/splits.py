@@ -26,8 +26,10 @@ def check_rule(rule: str) -> None:
         raise UserError(f"--held-out {rule}: expected auto, 4dgs, or a whole number k from 2 for every k-th frame")
 
 
-def choose(source: str, names: Sequence[str], own: Lists, rule: str, default: str) -> Lists:
-    """Names to train on and names held out.
+def choose(
+    source: str, names: Sequence[str], own: Lists, rule: str, default: str
+) -> tuple[list[str], list[str], tuple[str, ...]]:
+    """Names to train on and names held out, and a note if the rule leaves frames out of both.
 
     Args:
         source: what lists the frames, for messages.
@@ -41,6 +43,7 @@ def choose(source: str, names: Sequence[str], own: Lists, rule: str, default: st
     Raises:
         UserError: too few frames on either side.
     """
+    notes: tuple[str, ...] = ()
     if rule == "auto" and own[1]:
         train, test = own
     else:
@@ -50,12 +53,15 @@ def choose(source: str, names: Sequence[str], own: Lists, rule: str, default: st
         else:
             test = list(names[:: int(rule)])
             train = [name for i, name in enumerate(names) if i % int(rule)]
+        used = len(train) + len(test)
+        if used < len(names):
+            notes = (f"{used} of {len(names)} frames are used (held-out rule {rule})",)
     if len(train) < 2 or not test:
         raise UserError(
             f"{source}: {len(train)} frames to train with and {len(test)} held out, of {len(names)} listed; expected "
             "at least 2 and 1, or 5 in all if none is marked as held out"
         )
-    return train, test
+    return train, test, notes
 
 
 def lists(folder: Path) -> tuple[list[str], Lists]:

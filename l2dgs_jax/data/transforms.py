@@ -53,16 +53,16 @@ def read(folder: Path, downscale: int, held_out: str) -> Dataset:
     entries, own, ply = _entries(folder)
     names = list(entries)
     own = own if own[1] else splits.lists_beside(folder, names)
-    train, test = splits.choose(str(folder), names, own, held_out, default="8")
+    train, test, notes = splits.choose(str(folder), names, own, held_out, default="8")
     times = _times(folder, entries)
     pictures = _pictures(folder, {name: entries[name][2] for name in [*train, *test]}, downscale)
     frames = {name: _frame(name, *entries[name], times[name], picture) for name, picture in pictures.items()}
 
-    cloud = clouds.beside(folder, ply)
-    notes: tuple[str, ...] = ()
+    cloud = clouds.beside(folder, ply)  # not from sparse/: programs move and scale the world that COLMAP found
     if cloud is None:
         cloud = clouds.in_common_box(np.stack([frame.viewmat for frame in frames.values()]), str(folder)), None
-        notes = (f"{folder} has no point cloud: {clouds.COUNT} random points where its cameras look stand in for one",)
+        stand_in = f"{clouds.COUNT} random points where its cameras look stand in for one"
+        notes = (*notes, f"{folder} has no point cloud: {stand_in}")
     return assemble(folder, [frames[n] for n in train], [frames[n] for n in test], *cloud, downscale, notes)
 
 
@@ -122,20 +122,30 @@ def _entries(folder: Path) -> tuple[dict[str, Entry], Lists, str | None]:
     for part in ("train", held_out):
         path = folder / f"transforms_{part}.json"
         found = _listed(path, read_json(path, "the frames")) if part else {}
-        lists.append([name for name in found if name not in entries])
-        entries |= found
+        for name, (*_, picture) in found.items():
+            if name in entries and not entries[name][2].samefile(picture):
+                raise UserError(
+                    f"{path}: frame {picture} is '{name}' as {entries[name][2]} is; expected names that differ"
+                )
+        lists.append([name for name in found if name not in entries])  # what is trained on is not held out as well
+        entries = {**entries, **found, **entries}
     return entries, (lists[0], lists[1]), None
 
 
 def _listed(path: Path, content: dict[str, Any]) -> dict[str, Entry]:
     """The frames of a file, with what it says of all of them, in the order of their names."""
     shared = {key: entry for key, entry in content.items() if key != "frames"}
-    entries = {}
+    entries: dict[str, Entry] = {}
     for i, frame in enumerate(value(path, content, "frames", list)):
         if not isinstance(frame, dict):
             raise UserError(f"{path}: frame {i} is no JSON object; expected file_path and transform_matrix")
         picture = _picture(path, value(path, frame, "file_path", str))
-        entries[_name(path.parent, picture)] = (path, shared | frame, picture)
+        name = _name(path.parent, picture)
+        if name in entries:
+            raise UserError(
+                f"{path}: frames {entries[name][2]} and {picture} are both '{name}'; expected names that differ"
+            )
+        entries[name] = (path, shared | frame, picture)
     return dict(sorted(entries.items()))
 
 
@@ -150,11 +160,10 @@ def _picture(path: Path, file: str) -> Path:
 
 
 def _name(folder: Path, picture: Path) -> str:
-    """A picture's path without its suffix, relative to `images` or to the scene."""
-    for root in (folder / "images", folder):
-        if picture.is_relative_to(root):
-            return picture.relative_to(root).with_suffix("").as_posix()
-    return picture.stem
+    """A picture's path without its suffix, relative to `images` or to the scene, never upwards."""
+    parts = Path(os.path.relpath(picture, folder)).with_suffix("").parts
+    within = parts[1:] if parts[0] == "images" else parts
+    return "/".join(part for part in within or parts if part != os.pardir)
 
 
 def _times(folder: Path, entries: dict[str, Entry]) -> dict[str, float]:
@@ -168,7 +177,8 @@ def _times(folder: Path, entries: dict[str, Entry]) -> dict[str, float]:
 def _pictures(folder: Path, files: dict[str, Path], downscale: int) -> dict[str, Picture]:
     """The frames' own files, or smaller copies of those in `images`."""
     root = folder / "images"
-    inside = [name for name, file in files.items() if file.is_relative_to(root)]
+    within = {name: Path(os.path.relpath(file, root)) for name, file in files.items()}
+    inside = {name: path.as_posix() for name, path in within.items() if path.parts[0] != os.pardir}
     plain = {name: Picture(file, 1) for name, file in files.items()}
     return plain | dict(zip(inside, copies(folder, root, downscale, inside) if inside else (), strict=True))
 

@@ -9,14 +9,20 @@ from jaxtyping import Shaped
 
 from l2dgs_jax.data.dataset import Dataset
 from l2dgs_jax.data.images import to_bytes, write_image
+from l2dgs_jax.errors import UserError
 
 
 def write_pictures(dataset: Dataset, root: Path, folder: Path) -> None:
     """Write the frames as `root/<name>.png`, alpha 0 where they are not valid, and what `assemble` finds in `folder`.
 
     Raises:
-        UserError: a file cannot be written.
+        UserError: a file cannot be written, or a frame's name leads out of `root`.
     """
+    for name in (*dataset.train.names, *dataset.test.names):
+        if Path(name).is_absolute() or ".." in Path(name).parts:
+            raise UserError(
+                f"frame '{name}': the name leads out of the scene's folder; expected one without '..' or root"
+            )
     for part, split in (("train", dataset.train), ("val", dataset.test)):
         kinds: list[tuple[Path, Any]] = [
             (folder / "well" / "1x", split.welllit),
