@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from l2dgs_jax.config import Config, to_dict
-from l2dgs_jax.engine import TrainState
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.files import replacing
+from l2dgs_jax.step import TrainState
 
 
 class Checkpoint(NamedTuple):

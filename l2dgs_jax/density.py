@@ -48,12 +48,20 @@ def empty_stats(capacity: int) -> GrowthStats:
 
 
 def accumulate(
-    stats: GrowthStats, probe_gradient: Float[Array, "V N 2"], radii: Float[Array, "V N"], width: int, height: int
+    stats: GrowthStats, probe_gradient: Float[Array, "N 2"], radii: Float[Array, " N"], width: int, height: int
 ) -> GrowthStats:
-    """Add one step: the norm of the views' summed gradients, and one sighting for a Gaussian drawn in any view."""
+    """Add one step: the norm of the views' summed gradients, and one sighting for a Gaussian drawn in any view.
+
+    Args:
+        stats: so far.
+        probe_gradient: dL/d(mean2d) in pixels, summed over the views.
+        radii: the largest in any view, pixels; 0 where it was not drawn.
+        width: pixels.
+        height: pixels.
+    """
     to_ndc = 0.5 * jnp.array([width, height], probe_gradient.dtype)
-    norm = jnp.linalg.norm(probe_gradient.sum(0) * to_ndc[None], axis=-1)
-    return GrowthStats(stats.gradient + norm, stats.seen + (radii > 0).any(0).astype(stats.seen.dtype))
+    norm = jnp.linalg.norm(probe_gradient * to_ndc[None], axis=-1)
+    return GrowthStats(stats.gradient + norm, stats.seen + (radii > 0).astype(stats.seen.dtype))
 
 
 def densify(

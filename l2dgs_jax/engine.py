@@ -1,186 +1,59 @@
-"""The training step and the coarse-to-fine loop. No input or output: callers consume the steps that `run` yields."""
+"""The coarse-to-fine loop over one scene or many at once. No input or output: callers consume what `run` yields."""
 
 import dataclasses
-import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jax.sharding import Mesh
+from jax.sharding import PartitionSpec as P
+from jaxtyping import Array, Bool, Int, PyTree
 
-from l2dgs_jax import density, hexplane, losses, networks, optim
+from l2dgs_jax import devices, networks, overrides
 from l2dgs_jax.config import Config
 from l2dgs_jax.data.batching import view_indices
 from l2dgs_jax.data.dataset import Dataset, Split
-from l2dgs_jax.density import GrowthStats
+from l2dgs_jax.devices import MEMBERS, VIEWS
 from l2dgs_jax.rasterizer import count_pairs
-from l2dgs_jax.rendering import render
-from l2dgs_jax.scene import groups, initialise, observed_colors, pad_rows, rung
+from l2dgs_jax.scene import initialise, observed_colors, rung
+from l2dgs_jax.step import Batch, StepReport, TrainState, begin_stage, densify, train_step, with_capacity
 from l2dgs_jax.tone import Darkening, darkening
-from l2dgs_jax.types import Camera, Scene, SceneParams
+from l2dgs_jax.types import Camera, Scene
 
-with warnings.catch_warnings():
-    warnings.simplefilter("ignore", DeprecationWarning)  # jaxopt announces that it is unmaintained
-    from jaxopt import OptaxSolver
-    from jaxopt._src.optax_wrapper import OptaxState
-
+T = TypeVar("T")
 
 MARGIN = 1.3  # of the pair buffer over what was last needed: every size is a compilation
 
 
-class Batch(NamedTuple):
-    """The views of one step; images are sRGB in [0, 1], and nothing is learned where they are not `valid`."""
+class Member(NamedTuple):
+    """A scene in training: its views, its `resolve`d settings, and its state."""
 
-    cameras: Camera
-    images: Float[Array, "*S V H W 3"]
-    valid: Bool[Array, "*S V H W"] | None = None
-
-
-class TrainState(NamedTuple):
-    """All that a step reads and writes, and all that a checkpoint holds. `step` counts finished steps."""
-
-    scene: Scene
-    adam: optim.AdamState
-    stats: GrowthStats
-    step: Int[Array, "*S"]
-
-
-class StepReport(NamedTuple):
-    """What a step found. The state is unchanged if the pair buffer overflowed or a gradient was not finite.
-
-    Attributes:
-        loss: Eq. 15 plus the plane regularisers.
-        terms: each term, unweighted.
-        psnr: of the low-light estimate against the input, dB, before the step.
-        pairs: (Gaussian, tile) pairs that the step needs.
-        overflow: whether they did not fit.
-        finite: whether loss and gradient are.
-    """
-
-    loss: Float[Array, "*S"]
-    terms: dict[str, Float[Array, "*S"]]
-    psnr: Float[Array, "*S"]
-    pairs: Int[Array, "*S"]
-    overflow: Bool[Array, "*S"]
-    finite: Bool[Array, "*S"]
+    split: Split
+    config: Config
+    state: TrainState
 
 
 class Progress(NamedTuple):
-    """One finished step, as `run` yields it. `state` is valid until the next step is asked for."""
+    """One finished step, as `run` yields it. `states` is valid until the next step is asked for.
 
-    state: TrainState
+    Attributes:
+        step: number of finished steps; a member whose state has fewer has diverged and is frozen.
+        states: of all members, stacked; `devices.row` takes one out.
+        report: of all members, stacked.
+        pair_capacity: size of the pair buffer of each member.
+    """
+
+    step: int
+    states: TrainState
     report: StepReport
     pair_capacity: int
 
 
 class DivergedError(ArithmeticError):
-    """The loss or a gradient is not finite."""
-
-
-def sh_degree(step: Int[Array, ""] | int, config: Config) -> Int[Array, ""] | int:
-    """SH bands in use after `step` steps: one more every `config.sh_warmup`."""
-    return jnp.minimum(step // max(config.sh_warmup, 1), config.model.sh_degree)
-
-
-def exponent_target(config: Config) -> float:
-    """Where the prior of `config.loss.exponent_prior` pulls B1: its start, or 1 if that is left to chance."""
-    start = config.model.initial_exponents
-    return float(start[0]) if start else 1.0
-
-
-def objective(
-    params: SceneParams,
-    probe: Float[Array, "V N 2"],
-    state: TrainState,
-    batch: Batch,
-    config: Config,
-    moving: bool,
-    pair_capacity: int,
-) -> tuple[Float[Array, ""], tuple[StepReport, Float[Array, "V N"]]]:
-    """Eq. 15 plus the plane regularisers of 4DGS (arXiv 2310.08528), for one batch.
-
-    Gradients flow to `params` and to `probe`, zeros added to the projected centres.
-
-    Returns:
-        The loss, and (the report, the Gaussians' radii in every view).
-    """
-    height, width = batch.images.shape[1:3]
-    output = render(
-        state.scene._replace(params=params),
-        batch.cameras,
-        config.model,
-        width,
-        height,
-        moving=moving,
-        sh_degree=sh_degree(state.step, config),
-        pair_capacity=pair_capacity,
-        means2d_probe=probe,
-    )
-    cfg = config.loss
-    start, steps = (config.coarse_steps, config.fine_steps) if moving else (0, config.coarse_steps)
-    eta = losses.eta(state.step - start, steps, cfg) if cfg.eta_restarts else losses.eta(state.step, config.steps, cfg)
-    target, counted = targets(batch, output.images.lowlight)
-    loss, terms = losses.total(output, target, cfg, eta, exponent_target(config))
-    if moving:
-        smoothness, time_smoothness, time_l1 = hexplane.regularisers(params.hexplane)
-        loss += cfg.plane_smoothness * smoothness + cfg.time_smoothness * time_smoothness + cfg.time_l1 * time_l1
-    mse = jnp.mean(jnp.square(output.images.lowlight - target)) / counted
-    report = StepReport(loss, terms, -10 * jnp.log10(mse), output.pairs, output.overflow, jnp.isfinite(loss))
-    return loss, (report, output.radii)
-
-
-def targets(
-    batch: Batch, estimate: Float[Array, "V H W 3"]
-) -> tuple[Float[Array, "V H W 3"], Float[Array, ""] | float]:
-    """What the low-light estimate is compared with, and the share of pixels that count.
-
-    Where pixels are not valid the estimate is compared with itself, held constant: nothing can be learned there.
-    """
-    if batch.valid is None:
-        return batch.images, 1.0
-    target = jnp.where(batch.valid[..., None], batch.images, jax.lax.stop_gradient(estimate))
-    return target, jnp.maximum(batch.valid.mean(dtype=target.dtype), 1e-6)
-
-
-@partial(jax.jit, static_argnames=("config", "moving", "pair_capacity"), donate_argnums=0)
-def train_step(
-    state: TrainState, batch: Batch, config: Config, *, moving: bool, pair_capacity: int
-) -> tuple[TrainState, StepReport]:
-    """One Adam step on one batch; a step that cannot be trusted leaves the state as it was and says so."""
-    batch = jax.tree.map(lambda x: x if x.dtype == bool else x.astype(state.stats.seen.dtype), batch)
-
-    def value_and_grad(params: SceneParams) -> tuple:
-        probe = jnp.zeros((*batch.cameras.time.shape, state.scene.alive.shape[0], 2), batch.images.dtype)
-        (loss, (report, radii)), (gradient, probe_gradient) = jax.value_and_grad(objective, (0, 1), has_aux=True)(
-            params, probe, state, batch, config, moving, pair_capacity
-        )
-        return (loss, (report, radii, probe_gradient)), gradient
-
-    transformation = adam(state.scene.params, state.adam.schedules, config)
-    solver = OptaxSolver(value_and_grad, transformation, value_and_grad=True, has_aux=True, jit=False)
-    zero = jnp.zeros((), batch.images.dtype)
-    before = OptaxState(iter_num=state.step, value=zero, error=zero, internal_state=state.adam, aux=None)
-    params, after = solver.update(state.scene.params, before)
-    report, radii, probe_gradient = after.aux
-
-    height, width = batch.images.shape[1:3]
-    report = report._replace(finite=report.finite & jnp.isfinite(after.error))
-    stepped = TrainState(
-        scene=state.scene._replace(params=params),
-        adam=after.internal_state,
-        stats=density.accumulate(state.stats, probe_gradient, radii, width, height),
-        step=state.step + 1,
-    )
-    trusted = report.finite & ~report.overflow
-    return jax.tree.map(lambda new, old: jnp.where(trusted, new, old), stepped, state), report
-
-
-def adam(params: SceneParams, rates: dict[str, optim.Schedule], config: Config) -> optim.Transformation:
-    """The optimizer of all of `params`."""
-    return optim.adam(groups(params), rates, config.optim.beta1, config.optim.beta2, config.optim.eps)
+    """The loss or a gradient of every member is not finite."""
 
 
 def split_darkening(split: Split, config: Config) -> Darkening:
@@ -215,60 +88,198 @@ def initial_state(dataset: Dataset, config: Config) -> TrainState:
     scene = initialise(
         jax.random.key(config.seed), points, dataset.colors, train.cameras, config.model, capacity, reflectance
     )
-    return begin_stage(scene, jnp.zeros((), jnp.int32), config, config.coarse_steps)
+    return _begin_stage(scene, jnp.zeros((), jnp.int32), config, config.coarse_steps)
 
 
-@partial(jax.jit, static_argnames=("config", "stage_steps"))
-def begin_stage(scene: Scene, step: Int[Array, ""], config: Config, stage_steps: int) -> TrainState:
-    """A state with fresh optimizer moments, schedules and statistics, as 4DGS starts each stage."""
-    rates = optim.schedules(config.optim, scene.extent, stage_steps)
-    transformation = adam(scene.params, rates, config)
-    return TrainState(scene, transformation.init(scene.params), density.empty_stats(scene.alive.shape[0]), step)
+_begin_stage = jax.jit(begin_stage, static_argnames=("config", "stage_steps"))
 
 
-def run(split: Split, config: Config, state: TrainState, pair_capacity: int | None = None) -> Iterator[Progress]:
-    """Train from `state` to the end, coarse stage then fine, yielding after every step.
+def run(members: Sequence[Member], pair_capacity: int | None = None, mesh: Mesh | None = None) -> Iterator[Progress]:
+    """Train all members to the end, coarse stage then fine, by one program, yielding after every step.
+
+    A member begins where its state stands, once the others have come that far. If its loss or gradient is not finite
+    it stays as it was before that step, and the others go on.
 
     Args:
-        split: training views.
-        config: settings.
-        state: from `initial_state` or a checkpoint; its buffers are given up.
-        pair_capacity: size of the pair buffer to start with, as a checkpoint holds it.
+        members: their settings may differ in the numbers of `overrides.TRACED`, their states in the number of rows.
+        pair_capacity: size of the pair buffer of a member to start with, as a checkpoint holds it.
+        mesh: over which members and the views of a batch are spread (see `devices.mesh`); None for one device.
 
     Raises:
-        DivergedError: loss or gradient of a step are not finite.
+        DivergedError: no member is left.
     """
-    pair_capacity = pair_capacity or first_capacity(split, config, state.scene)
-    for step in range(int(state.step), config.steps):
+    config, start = members[0].config, min(int(member.state.step) for member in members)
+    rows, shares = (mesh.shape[MEMBERS], mesh.shape[VIEWS]) if mesh else (1, 1)
+    views = config.batch_size // shares
+    pair_capacity = pair_capacity or max(first_capacity(m.split, m.state.scene, views) for m in members)
+    # Every device has as many members; those that fill the last ones up wait for a step that never comes.
+    waiting = members[0]._replace(state=members[0].state._replace(step=jnp.asarray(-1, jnp.int32)))
+    members = [*members, *[waiting] * (-len(members) % rows)]
+    states = devices.place(_stack_states([member.state for member in members]), mesh, MEMBERS)
+    values = devices.place(_differences([member.config for member in members]), mesh, MEMBERS)
+
+    for step in range(start, config.steps):
         moving = step >= config.coarse_steps
         stage_start = config.coarse_steps if moving else 0
         if moving and step == stage_start:
-            state = begin_stage(state.scene, state.step, config, config.fine_steps)
+            states = begin_fine_stage(states, values, step, config=config, mesh=mesh)
 
-        batch = load_batch(split, view_indices(config.seed, step, config.batch_size, len(split.names)))
-        while True:
-            state, report = train_step(state, batch, config, moving=moving, pair_capacity=pair_capacity)
-            if not report.overflow:
-                break
-            pair_capacity = rung(MARGIN * float(report.pairs))
-        if not report.finite:
-            terms = ", ".join(f"{name} {float(value):.3g}" for name, value in report.terms.items())
-            raise DivergedError(f"the loss or its gradient is not finite at step {step} ({terms})")
+        batches = devices.place(_stack([_next_batch(member, step) for member in members]), mesh, MEMBERS, VIEWS)
+        take = partial(train_steps, config=config, moving=moving, mesh=mesh)
+        states, report, tally = take(states, batches, values, step, pair_capacity=pair_capacity)
+        while tally.pairs > pair_capacity:
+            pair_capacity = rung(MARGIN * float(tally.pairs))
+            states, again, tally = take(states, batches, values, step, pair_capacity=pair_capacity)
+            report = jax.tree.map(partial(jnp.where, report.overflow), again, report)
+        if not tally.left:
+            raise DivergedError(_complaint(report, step))
 
         if density_due(step + 1 - stage_start, config):
-            state = densify(state, config)
-        yield Progress(state, report, pair_capacity)
+            states = densify_all(states, values, step + 1, config=config, mesh=mesh)
+        yield Progress(step + 1, states, report, pair_capacity)
 
 
-def first_capacity(split: Split, config: Config, scene: Scene) -> int:
-    """A pair buffer for a batch of the first views, their Gaussians at rest, with a margin for the others."""
+class Tally(NamedTuple):
+    """What all processes must agree on after a step.
+
+    Attributes:
+        pairs: the most pairs that a member needs which was to take the step.
+        left: number of members that have taken it.
+    """
+
+    pairs: Int[Array, ""]
+    left: Int[Array, ""]
+
+
+@partial(jax.jit, static_argnames=("config", "moving", "pair_capacity", "mesh"), donate_argnums=0)
+def train_steps(
+    states: TrainState,
+    batches: Batch,
+    values: dict[str, Any],
+    step: Int[Array, ""] | int,
+    *,
+    config: Config,
+    moving: bool,
+    pair_capacity: int,
+    mesh: Mesh | None = None,
+) -> tuple[TrainState, StepReport, Tally]:
+    """`train_step` number `step` of every member that has come that far.
+
+    Args:
+        states: of the members, stacked.
+        batches: likewise.
+        values: the settings in which members differ, by dotted name, stacked.
+        step: its number.
+        config: all other settings.
+        moving: whether it is a step of the fine stage.
+        pair_capacity: size of each member's pair buffer.
+        mesh: see `run`.
+    """
+
+    def take(step, state, values, batch):
+        own = overrides.replace(config, values)
+        axis = VIEWS if mesh else None
+        return train_step(state, batch, own, moving=moving, pair_capacity=pair_capacity, at=step, axis=axis)
+
+    after, report = _each_member(take, mesh, step, states, values, batches)
+    pairs = jnp.where(states.step == step, report.pairs, 0).max()
+    return after, report, Tally(pairs, (after.step > step).sum())
+
+
+@partial(jax.jit, static_argnames=("config", "mesh"))
+def begin_fine_stage(
+    states: TrainState, values: dict[str, Any], step: Int[Array, ""] | int, *, config: Config, mesh: Mesh | None
+) -> TrainState:
+    """`begin_stage` for every member that has come to that step."""
+
+    def begin(step, state, values):
+        fresh = begin_stage(state.scene, state.step, overrides.replace(config, values), config.fine_steps)
+        return _where(state.step == step, fresh, state)
+
+    return _each_member(begin, mesh, step, states, values)
+
+
+def densify_all(
+    states: TrainState, values: dict[str, Any], step: int, *, config: Config, mesh: Mesh | None
+) -> TrainState:
+    """`densify` for every member that has come to that step, all moving up the ladder when one runs out of rows."""
+    while True:
+        grown, rows = _densify_all(states, values, step, config=config, mesh=mesh)
+        if not rows:
+            return grown
+        states = _with_capacity(states, rung(int(rows)))
+
+
+@partial(jax.jit, static_argnames=("config", "mesh"))
+def _densify_all(states, values, step, *, config, mesh):
+    def grow(step, state, values):
+        grown, rows = densify(state, overrides.replace(config, values))
+        due = state.step == step
+        return _where(due, grown, state), jnp.where(due, rows, 0)
+
+    grown, rows = _each_member(grow, mesh, step, states, values)
+    return grown, rows.max()
+
+
+_with_capacity = partial(jax.jit, static_argnums=1)(jax.vmap(with_capacity, (0, None)))
+
+
+def _each_member(function: Callable, mesh: Mesh | None, step: Int[Array, ""] | int, *trees: PyTree) -> Any:
+    """`function(step, *rows)` of every row of the trees, those that share a device in one vmap."""
+
+    def here(step, *trees):
+        if len(jax.tree.leaves(trees)[0]) > 1:
+            return jax.vmap(partial(function, step))(*trees)
+        alone = function(step, *jax.tree.map(lambda x: x.squeeze(0), trees))
+        return jax.tree.map(lambda x: x[None], alone)
+
+    if mesh is None:
+        return here(step, *trees)
+    specs = (P(), P(MEMBERS), P(MEMBERS), P(MEMBERS, VIEWS))[: 1 + len(trees)]
+    return jax.shard_map(here, mesh=mesh, in_specs=specs, out_specs=P(MEMBERS), check_vma=False)(step, *trees)
+
+
+def _where(condition: Bool[Array, ""], new: T, old: T) -> T:
+    return jax.tree.map(partial(jnp.where, condition), new, old)
+
+
+def _stack(trees: Sequence[T]) -> T:
+    """Host arrays stacked; a single one is not copied."""
+    return jax.tree.map(lambda *x: np.stack(x) if len(x) > 1 else np.asarray(x[0])[None], *trees)
+
+
+def _stack_states(states: Sequence[TrainState]) -> TrainState:
+    """States stacked in new buffers, with as many rows as the largest has."""
+    capacity = max(len(state.scene.alive) for state in states)
+    return jax.tree.map(lambda *x: jnp.stack(x), *[with_capacity(state, capacity) for state in states])
+
+
+def _differences(configs: Sequence[Config]) -> dict[str, Any]:
+    """The settings in which configs differ, by dotted name, stacked."""
+    return {name: _stack(column) for name, column in overrides.differences(configs).items()}
+
+
+def _next_batch(member: Member, step: int) -> Batch:
+    split, config = member.split, member.config
+    return load_batch(split, view_indices(config.seed, step, config.batch_size, len(split.names)))
+
+
+def _complaint(report: StepReport, step: int) -> str:
+    """What was found in the last member that diverged, as far as this process can see it."""
+    terms = {name: value.addressable_shards[0].data[0] for name, value in report.terms.items()}
+    found = ", ".join(f"{name} {float(value):.3g}" for name, value in terms.items())
+    return f"the loss or its gradient is not finite at step {step} ({found})"
+
+
+def first_capacity(split: Split, scene: Scene, views: int) -> int:
+    """A pair buffer for the first views, the Gaussians at rest, with a margin for the others."""
     gaussians = scene.params.gaussians
-    batch = load_batch(split, np.arange(config.batch_size) % len(split.names))
+    batch = load_batch(split, np.arange(views) % len(split.names))
     cameras = jax.tree.map(lambda x: jnp.asarray(x, gaussians.means.dtype), batch.cameras)
     height, width = split.images.shape[1:3]
     opacities = jnp.where(scene.alive, jax.nn.sigmoid(gaussians.logit_opacities), 0)
     rows = (gaussians.means, gaussians.quats, jnp.exp(gaussians.log_scales), opacities)
-    per_view = (jnp.broadcast_to(x[None], (config.batch_size, *x.shape)) for x in rows)
+    per_view = (jnp.broadcast_to(x[None], (views, *x.shape)) for x in rows)
     return rung(MARGIN * float(count_pairs(*per_view, cameras.viewmat, cameras.K, width, height)))
 
 
@@ -282,39 +293,3 @@ def density_due(stage_step: int, config: Config) -> bool:
     """Whether the stage's step of that number is followed by densification."""
     cfg = config.density
     return cfg.start < stage_step < cfg.stop and stage_step % cfg.interval == 0
-
-
-def densify(state: TrainState, config: Config) -> TrainState:
-    """Clone, split and prune, moving up the capacity ladder when rows run out."""
-    while True:
-        grown, missing, wanted = _densify(state, config)
-        if not missing:
-            return grown
-        state = with_capacity(state, rung(int(state.scene.alive.sum()) + int(wanted)))
-
-
-@partial(jax.jit, static_argnames="config")
-def _densify(state: TrainState, config: Config) -> tuple[TrainState, Int[Array, ""], Int[Array, ""]]:
-    scene = state.scene
-    key = jax.random.fold_in(jax.random.key(config.seed), state.step)
-    result = density.densify(scene.params.gaussians, scene.alive, state.stats, scene.extent, key, config.density)
-    forget = lambda rows: jnp.where(result.changed.reshape(-1, *[1] * (rows.ndim - 1)), 0, rows)
-    moments = lambda tree: tree._replace(gaussians=jax.tree.map(forget, tree.gaussians))
-    grown = TrainState(
-        scene=scene._replace(params=scene.params._replace(gaussians=result.gaussians), alive=result.alive),
-        adam=state.adam._replace(mu=moments(state.adam.mu), nu=moments(state.adam.nu)),
-        stats=jax.tree.map(jnp.zeros_like, state.stats),
-        step=state.step,
-    )
-    return grown, result.missing, result.wanted
-
-
-def with_capacity(state: TrainState, capacity: int) -> TrainState:
-    """The same state with dead rows appended up to `capacity`."""
-    grow = lambda tree: tree._replace(gaussians=jax.tree.map(lambda x: pad_rows(x, capacity), tree.gaussians))
-    return TrainState(
-        scene=state.scene._replace(params=grow(state.scene.params), alive=pad_rows(state.scene.alive, capacity)),
-        adam=state.adam._replace(mu=grow(state.adam.mu), nu=grow(state.adam.nu)),
-        stats=jax.tree.map(lambda x: pad_rows(x, capacity), state.stats),
-        step=state.step,
-    )

@@ -22,7 +22,7 @@ def total(
     target: Float[Array, "V H W 3"],
     cfg: LossConfig,
     eta: Scalar | float,
-    exponent_target: float = 1.0,
+    exponent_target: Scalar | float = 1.0,
 ) -> tuple[Scalar, dict[str, Scalar]]:
     """Eq. 15 over V views, plus the optional total variation of L_w and exponent prior; plane regularisers excluded.
 
@@ -36,13 +36,14 @@ def total(
         exponent_target: value that the exponent prior pulls B1 to.
 
     Returns:
-        The weighted sum, and each term before its weight by name. Terms of weight 0 are neither computed nor listed.
+        The weighted sum, and each term before its weight by name. Terms of weight 0 are neither computed nor listed,
+        unless that weight is traced.
     """
     images = render.images
     exposed = images.reflectance if cfg.exposure_of == "reflectance" else images.welllit
     illumination = images.illumination[..., None]
     b1, b2 = images.attenuation[..., :1], images.attenuation[..., 1:]
-    terms: dict[str, tuple[float, Callable[[], Scalar]]] = {
+    terms: dict[str, tuple[Scalar | float, Callable[[], Scalar]]] = {
         "l1": (1.0, lambda: photometric_l1(images.lowlight, target, cfg.l1_on, eta, cfg.eps)),
         "ssim": (cfg.ssim, lambda: photometric_ssim(images.lowlight, target, eta, cfg.eps)),
         "exposure": (
@@ -65,7 +66,8 @@ def total(
         "illumination_tv": (cfg.illumination_tv, lambda: total_variation(images.illumination)),
         "exponent_prior": (cfg.exponent_prior, lambda: exponent_prior(images.attenuation, exponent_target)),
     }
-    values = {name: term() for name, (weight, term) in terms.items() if weight != 0.0}
+    absent = lambda weight: isinstance(weight, float | int) and weight == 0
+    values = {name: term() for name, (weight, term) in terms.items() if not absent(weight)}
     return jnp.stack([terms[name][0] * value for name, value in values.items()]).sum(), values
 
 
@@ -75,7 +77,7 @@ def eta(step: Int[Array, ""] | int, steps: int, cfg: LossConfig) -> Scalar:
     return cfg.eta_start * (cfg.eta_end / cfg.eta_start) ** fraction
 
 
-def tonemap(image: Float[Array, "*S"], eta: Scalar | float, eps: float) -> Float[Array, "*S"]:
+def tonemap(image: Float[Array, "*S"], eta: Scalar | float, eps: Scalar | float) -> Float[Array, "*S"]:
     """(I + eps)^eta of Eq. 10, which lifts dark values; `image` >= 0 carries gradients."""
     return power(image + eps, jnp.asarray(eta, image.dtype))
 
@@ -85,7 +87,7 @@ def photometric_l1(
     target: Float[Array, "*B H W C"],
     on: Literal["raw", "tonemapped"],
     eta: Scalar | float,
-    eps: float,
+    eps: Scalar | float,
 ) -> Scalar:
     """First term of Eq. 10: mean absolute difference, of the images or of the `tonemap`ped images."""
     if on == "tonemapped":
@@ -94,14 +96,14 @@ def photometric_l1(
 
 
 def photometric_ssim(
-    prediction: Float[Array, "*B H W C"], target: Float[Array, "*B H W C"], eta: Scalar | float, eps: float
+    prediction: Float[Array, "*B H W C"], target: Float[Array, "*B H W C"], eta: Scalar | float, eps: Scalar | float
 ) -> Scalar:
     """Second term of Eq. 10: 1 - SSIM of the `tonemap`ped images, windows padded with zeros."""
     return 1 - metrics.ssim_map(tonemap(prediction, eta, eps), tonemap(target, eta, eps)).mean()
 
 
 def exposure(
-    image: Float[Array, "*B H W C"], level: float, window: int | None, form: Literal["absolute", "squared"]
+    image: Float[Array, "*B H W C"], level: Scalar | float, window: int | None, form: Literal["absolute", "squared"]
 ) -> Scalar:
     """Exposure control (Eq. 11; Zero-DCE, arXiv 2001.06826): distance of local mean intensity from a level.
 
@@ -152,7 +154,7 @@ def amplification(illumination: Float[Array, "*B H W"]) -> Scalar:
 def structure(
     exponent: Float[Array, "*B H W 1"],
     guide: Float[Array, "*B H W C"],
-    beta: float,
+    beta: Scalar | float,
     gradient: Literal["components", "magnitude"],
 ) -> Scalar:
     """Scene-adaptive structure (Eq. 14): mean |beta grad B - grad guide|; both images carry gradients.
@@ -176,7 +178,7 @@ def total_variation(image: Float[Array, "*B H W"]) -> Scalar:
     return _mean(jnp.abs(dx)) + _mean(jnp.abs(dy))
 
 
-def exponent_prior(attenuation: Float[Array, "*B H W 2"], target: float) -> Scalar:
+def exponent_prior(attenuation: Float[Array, "*B H W 2"], target: Scalar | float) -> Scalar:
     """Mean |B1 - target|: keeps the colours of the well-lit image from drifting with the exponent of R_w."""
     return jnp.abs(attenuation[..., 0] - target).mean()
 

@@ -66,7 +66,7 @@ def schedules(cfg: OptimConfig, extent: Float[Array, ""], stage_steps: int) -> d
         "scales": (cfg.scales_lr, cfg.scales_lr),
         "quats": (cfg.quats_lr, cfg.quats_lr),
     }
-    steps = max(cfg.decay_steps if cfg.decay_steps is not None else stage_steps, 1)
+    steps = jnp.maximum(stage_steps if cfg.decay_steps is None else cfg.decay_steps, 1)
     factor = lambda name: extent if name in cfg.extent_scales else jnp.ones_like(extent)
     return {
         name: Schedule(start * factor(name), end * factor(name), jnp.full_like(extent, steps))
@@ -74,7 +74,13 @@ def schedules(cfg: OptimConfig, extent: Float[Array, ""], stage_steps: int) -> d
     }
 
 
-def adam(groups: PyTree, rates: dict[str, Schedule], beta1: float, beta2: float, eps: float) -> Transformation:
+def adam(
+    groups: PyTree,
+    rates: dict[str, Schedule],
+    beta1: Float[Array, ""] | float,
+    beta2: Float[Array, ""] | float,
+    eps: Float[Array, ""] | float,
+) -> Transformation:
     """Adam (Kingma and Ba, arXiv 1412.6980) with bias correction and one schedule a group.
 
     Args:

@@ -11,6 +11,7 @@ from l2dgs_jax.data.dataset import Dataset
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.files import replacing
 from l2dgs_jax.rendering import Renderer
+from l2dgs_jax.step import TrainState, sh_degree
 
 SETTINGS = "config.json"
 CHECKPOINT = "checkpoint.npz"
@@ -34,7 +35,7 @@ class Run:
     folder: Path
     config: Config
     dataset: Dataset
-    state: engine.TrainState
+    state: TrainState
 
     @property
     def moving(self) -> bool:
@@ -49,7 +50,7 @@ class Run:
             self.dataset.width,
             self.dataset.height,
             moving=self.moving,
-            sh_degree=int(engine.sh_degree(int(self.state.step), self.config)),
+            sh_degree=int(sh_degree(int(self.state.step), self.config)),
         )
 
 

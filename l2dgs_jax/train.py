@@ -1,8 +1,6 @@
 """`python -m l2dgs_jax.train SCENE`: train a scene and leave a run folder with checkpoints, metrics and pictures."""
 
 import dataclasses
-import json
-import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,13 +10,11 @@ import tyro
 from tqdm import tqdm
 
 from l2dgs_jax import checkpoint, cli, engine, runs, visualize
-from l2dgs_jax.checkpoint import Checkpoint
 from l2dgs_jax.config import PRESETS, Config
 from l2dgs_jax.data import load
 from l2dgs_jax.data.images import write_image
 from l2dgs_jax.errors import UserError
-
-LOG_EVERY = 10  # steps between lines of the metrics file
+from l2dgs_jax.recording import Recorder
 
 
 @dataclass(frozen=True)
@@ -57,7 +53,8 @@ def train(arguments: Sequence[str]) -> None:
     print(f"{dataset.name}: {len(dataset.train.names)} frames of {dataset.width}x{dataset.height}; run folder {folder}")
     start = int(state.step)
     try:
-        _consume(engine.run(dataset.train, config, state, pair_capacity), folder, config, start)
+        member = engine.Member(dataset.train, config, state)
+        _consume(engine.run([member], pair_capacity), folder, config, start)
     except engine.DivergedError as error:
         raise UserError(
             f"{folder}: {error}; expected finite values: lower the learning rates and --resume from the checkpoint"
@@ -105,35 +102,17 @@ def _run_folder(scene: str, resume: bool) -> Path:
 
 
 def _consume(steps: Iterator[engine.Progress], folder: Path, config: Config, done: int) -> None:
-    """Show, log and save the steps of a training."""
-    metrics = folder / runs.METRICS
-    kept = [line for line in metrics.read_text().splitlines() if json.loads(line)["step"] <= done] if done else []
-    metrics.write_text("".join(f"{line}\n" for line in kept))
-    begun = time.monotonic()
-    with open(metrics, "a") as log, tqdm(total=config.steps, initial=done, unit="step", dynamic_ncols=True) as bar:
-        for state, report, pair_capacity in steps:
-            step = int(state.step)
+    """Record the steps of a training and show how it goes."""
+    record = Recorder(folder, config, done)
+    with tqdm(total=config.steps, initial=done, unit="step", dynamic_ncols=True) as bar:
+        for progress in steps:
             bar.update()
-            if step % LOG_EVERY == 0 or step == config.steps:
-                stage = "coarse" if step <= config.coarse_steps else "fine"
-                values = {"loss": report.loss, "psnr": report.psnr, **report.terms}
-                line = {
-                    "step": step,
-                    "stage": stage,
-                    "gaussians": int(state.scene.alive.sum()),
-                    "pairs": int(report.pairs),
-                }
-                line |= {name: round(float(value), 6) for name, value in values.items()}
-                log.write(json.dumps(line | {"seconds": round(time.monotonic() - begun, 2)}) + "\n")
-                log.flush()
-                bar.set_description(stage)
+            line = record(progress)
+            if line:
+                bar.set_description(line["stage"])
                 bar.set_postfix_str(
                     f"loss {line['loss']:.3f}, low-light {line['psnr']:.1f} dB, {line['gaussians']} Gaussians"
                 )
-            if step == config.coarse_steps:
-                checkpoint.save(folder / runs.COARSE, Checkpoint(state, pair_capacity), config)
-            if step % config.checkpoint_every == 0 or step == config.steps:
-                checkpoint.save(folder / runs.CHECKPOINT, Checkpoint(state, pair_capacity), config)
 
 
 if __name__ == "__main__":

@@ -123,9 +123,9 @@ def test_the_threshold_is_on_the_mean_over_sightings():
     assert result.wanted == 1
 
 
-def test_accumulate_sums_views_before_the_norm_and_counts_sightings_once():
-    gradient = jnp.array([[[3.0, 0.0], [1.0, 0.0]], [[0.0, 2.0], [-1.0, 0.0]]])
-    radii = jnp.array([[1.0, 0.0], [2.0, 0.0]])
+def test_accumulate_adds_norms_in_normalised_coordinates_and_sightings():
+    gradient = jnp.array([[3.0, 2.0], [0.0, 0.0]])
+    radii = jnp.array([2.0, 0.0])
     result = accumulate(stats([1.0, 1.0], [5.0, 5.0]), gradient, radii, 2, 4)
     np.testing.assert_allclose(result.gradient, [1 + 5.0, 1 + 0.0])
     np.testing.assert_allclose(result.seen, [6.0, 5.0])

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from l2dgs_jax import checkpoint, engine
+from l2dgs_jax import checkpoint, devices, engine, step
 from l2dgs_jax.checkpoint import Checkpoint
 from l2dgs_jax.config import PRESETS, DensityConfig, from_dict, to_dict
 from l2dgs_jax.data.dataset import Dataset, Split
@@ -57,8 +57,19 @@ def dataset():
 
 def finish(dataset, config, state=None, pair_capacity=None):
     """The last step of a run."""
-    steps = engine.run(dataset.train, config, state or engine.initial_state(dataset, config), pair_capacity)
-    return collections.deque(steps, maxlen=1).pop()
+    member = engine.Member(dataset.train, config, state or engine.initial_state(dataset, config))
+    return collections.deque(engine.run([member], pair_capacity), maxlen=1).pop()
+
+
+def state_of(progress, member=0):
+    return devices.row(progress.states, member)
+
+
+def train_step(state, batch, config, moving):
+    """A step of one scene, compiled; the state stays valid."""
+    return jax.jit(step.train_step, static_argnames=("config", "moving", "pair_capacity"))(
+        state, batch, config, moving=moving, pair_capacity=4096
+    )
 
 
 @pytest.fixture(scope="module")
@@ -84,7 +95,7 @@ def objective_of(dataset, config, moving):
     probe = jnp.zeros((2, state.scene.alive.shape[0], 2))
 
     def value(params, probe):
-        return engine.objective(params, probe, state, batch, config, moving, 4096)[0]
+        return step.objective(params, probe, state, batch, config, moving, 4096)[0]
 
     return jax.jit(jax.value_and_grad(value, argnums=(0, 1))), params, probe
 
@@ -119,11 +130,11 @@ def test_gradient_of_the_whole_objective_by_directional_differences(dataset, pre
         direction = random_like(params, mask, jax.random.key(index))
         slope = sum(jnp.vdot(g, d) for g, d in zip(*map(jax.tree.leaves, (gradient[0], direction)), strict=True))
         differences = []
-        for step in (1e-6, 5e-7):
+        for size in (1e-6, 5e-7):
             ahead, behind = (
-                value(jax.tree.map(lambda p, d, s=sign * step: p + s * d, params, direction)) for sign in (1, -1)
+                value(jax.tree.map(lambda p, d, s=sign * size: p + s * d, params, direction)) for sign in (1, -1)
             )
-            differences.append((ahead - behind) / (2 * step))
+            differences.append((ahead - behind) / (2 * size))
         scale = max(abs(float(slope)), 1e-4)
         assert min(abs(float(slope - d)) for d in differences) < 2e-3 * scale, (name, slope, differences)
         if name in ("gaussians", "bafe") or moving:
@@ -149,8 +160,8 @@ def test_nothing_is_learned_from_pixels_that_do_not_count(dataset):
         states.append(engine.initial_state(dataclasses.replace(dataset, train=split), config))
         batch = engine.load_batch(split, np.array([1, 4]))
         batch = batch._replace(images=jnp.asarray(batch.images, float))
-        targets.append(engine.targets(batch, estimate))
-        assert jnp.all(jax.grad(lambda x, batch=batch: engine.targets(batch, x)[0].sum())(estimate) == 0)
+        targets.append(step.targets(batch, estimate))
+        assert jnp.all(jax.grad(lambda x, batch=batch: step.targets(batch, x)[0].sum())(estimate) == 0)
     assert_equal_states(*states)
     assert_equal_states(*targets)
     seen = valid[[1, 4]]
@@ -166,7 +177,7 @@ def test_a_step_takes_a_mask_of_pixels_that_count(dataset):
     batch = jax.tree.map(lambda x: jnp.asarray(x, float), engine.load_batch(dataset.train, np.array([1, 4])))
     half = jnp.arange(WIDTH) < WIDTH // 2
     report = jax.jit(
-        lambda valid: engine.objective(
+        lambda valid: step.objective(
             state.scene.params, probe, state, batch._replace(valid=valid), config, False, 4096
         )[1][0]
     )
@@ -178,10 +189,8 @@ def test_a_step_takes_a_mask_of_pixels_that_count(dataset):
 
 def test_training_lowers_the_loss_and_grows(dataset):
     config = tiny(coarse_steps=40, fine_steps=0)
-    reports = [
-        (float(p.report.loss), int(p.state.scene.alive.sum()))
-        for p in engine.run(dataset.train, config, engine.initial_state(dataset, config))
-    ]
+    member = engine.Member(dataset.train, config, engine.initial_state(dataset, config))
+    reports = [(float(p.report.loss[0]), int(p.states.scene.alive.sum())) for p in engine.run([member])]
     losses, counts = zip(*reports, strict=True)
     assert np.mean(losses[-5:]) < 0.9 * np.mean(losses[:5])
     assert counts[-1] == 60 > counts[0] == 25
@@ -190,34 +199,36 @@ def test_training_lowers_the_loss_and_grows(dataset):
 def test_a_resumed_run_equals_the_uninterrupted_one(dataset, finished, tmp_path):
     config = tiny()
     for stop in (3, 4, 6):
-        for progress in engine.run(dataset.train, config, engine.initial_state(dataset, config)):
-            if int(progress.state.step) == stop:
-                checkpoint.save(tmp_path / "c.npz", Checkpoint(progress.state, progress.pair_capacity), config)
+        member = engine.Member(dataset.train, config, engine.initial_state(dataset, config))
+        for progress in engine.run([member]):
+            if progress.step == stop:
+                saved = Checkpoint(state_of(progress), progress.pair_capacity)
+                checkpoint.save(tmp_path / "c.npz", saved, config)
                 break
         state, pair_capacity = checkpoint.load(tmp_path / "c.npz", config, engine.initial_state(dataset, config))
         assert int(state.step) == stop
-        assert_equal_states(finish(dataset, config, state, pair_capacity).state, finished.state)
+        assert_equal_states(finish(dataset, config, state, pair_capacity).states, finished.states)
 
 
 def test_a_stage_compiles_once(dataset):
     config = tiny(density=DensityConfig(start=1000))
-    compiled = engine.train_step._cache_size()
+    compiled = engine.train_steps._cache_size()
     finish(dataset, config, pair_capacity=8192)
-    assert engine.train_step._cache_size() == compiled + 2
+    assert engine.train_steps._cache_size() == compiled + 2
 
 
 def test_a_small_pair_buffer_grows_and_changes_nothing(dataset, finished):
     small = finish(dataset, tiny(), pair_capacity=8)
     assert small.pair_capacity > 8
-    for x, y in zip(*map(jax.tree.leaves, (small.state.scene, finished.state.scene)), strict=True):
+    for x, y in zip(*map(jax.tree.leaves, (small.states.scene, finished.states.scene)), strict=True):
         np.testing.assert_allclose(x, y, rtol=1e-6, atol=1e-9)
 
 
 def test_dead_rows_are_inert(dataset):
     config = tiny(density=DensityConfig(start=1000))
     state = engine.initial_state(dataset, config)
-    wide = finish(dataset, config, engine.with_capacity(state, 2000)).state
-    plain = finish(dataset, config, engine.initial_state(dataset, config)).state
+    wide = state_of(finish(dataset, config, step.with_capacity(state, 2000)))
+    plain = state_of(finish(dataset, config))
     rows = plain.scene.alive.shape[0]
     for x, y in zip(*map(jax.tree.leaves, (plain.scene.params.gaussians, wide.scene.params.gaussians)), strict=True):
         np.testing.assert_allclose(x, y[:rows], rtol=1e-6, atol=1e-9)
@@ -226,7 +237,7 @@ def test_dead_rows_are_inert(dataset):
 
 def test_the_first_pair_buffer_fits_the_first_views(dataset):
     config = tiny()
-    scene = engine.with_capacity(engine.initial_state(dataset, config), 1500).scene
+    scene = step.with_capacity(engine.initial_state(dataset, config), 1500).scene
     gaussians = scene.params.gaussians
     everywhere = gaussians._replace(
         means=jnp.zeros_like(gaussians.means).at[:, 2].set(2), log_scales=jnp.ones_like(gaussians.log_scales)
@@ -235,7 +246,7 @@ def test_the_first_pair_buffer_fits_the_first_views(dataset):
     tiles = 2 * 2
     for alive in (1000, 1500):
         scene = scene._replace(alive=jnp.arange(1500) < alive)
-        capacity = engine.first_capacity(dataset.train, config, scene)
+        capacity = engine.first_capacity(dataset.train, scene, config.batch_size)
         assert capacity == engine.rung(1.3 * alive * tiles * config.batch_size)
 
 
@@ -255,11 +266,10 @@ def test_a_step_with_a_nan_changes_nothing_and_stops_the_run(dataset):
     images = dataset.train.images.copy()
     images[:, 0, 0] = np.nan
     state = engine.initial_state(dataset, config)
-    before = jax.tree.map(np.array, state)
     batch = engine.load_batch(dataclasses.replace(dataset.train, images=images), np.array([0, 1]))
-    after, report = engine.train_step(state, batch, config, moving=False, pair_capacity=4096)
+    after, report = train_step(state, batch, config, moving=False)
     assert not report.finite
-    assert_equal_states(after, before)
+    assert_equal_states(after, state)
     with pytest.raises(engine.DivergedError, match="step 0"):
         finish(dataclasses.replace(dataset, train=dataclasses.replace(dataset.train, images=images)), config)
 
@@ -270,10 +280,10 @@ def test_vmap_over_scenes_equals_a_loop(dataset):
     states = [engine.initial_state(d, config) for d in datasets]
     batches = [engine.load_batch(d.train, np.array([0, 3])) for d in datasets]
     stack = lambda trees: jax.tree.map(lambda *x: jnp.stack([jnp.asarray(v) for v in x]), *trees)
-    step = lambda state, batch: engine.train_step(state, batch, config, moving=True, pair_capacity=4096)
-    together, reports = jax.vmap(step)(stack(states), stack(batches))
+    take = lambda state, batch: train_step(state, batch, config, moving=True)
+    together, reports = jax.vmap(take)(stack(states), stack(batches))
     for index, (state, batch) in enumerate(zip(states, batches, strict=True)):
-        alone, report = step(state, batch)
+        alone, report = take(state, batch)
         np.testing.assert_allclose(reports.loss[index], report.loss, rtol=1e-9)
         for x, y in zip(*map(jax.tree.leaves, (together, alone)), strict=True):
             # Round Gaussians have no gradient in their quaternions but rounding noise, which Adam magnifies.

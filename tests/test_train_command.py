@@ -105,7 +105,7 @@ def refuses(monkeypatch, capsys):
     def compiled(*_, **__):
         raise AssertionError("reached the first compilation")
 
-    monkeypatch.setattr(engine, "train_step", compiled)
+    monkeypatch.setattr(engine, "train_steps", compiled)
     monkeypatch.setattr(cli, "use_compilation_cache", lambda: None)
 
     def check(*arguments, naming):

@@ -16,12 +16,14 @@ import numpy as np
 from experiments.benchmarks.native import NativeBlend
 from experiments.benchmarks.scenes import cloud, training
 from experiments.benchmarks.stopwatch import best_of, peak_memory, resident_memory
-from l2dgs_jax import engine, hexplane, losses, networks
+from l2dgs_jax import hexplane, losses, networks
 from l2dgs_jax.config import PRESETS
 from l2dgs_jax.decomposition import decompose
 from l2dgs_jax.deformation import deform
 from l2dgs_jax.rasterizer import count_pairs, rasterize
 from l2dgs_jax.rendering import Renderer, in_order
+from l2dgs_jax.scene import rung
+from l2dgs_jax.step import adam, train_step
 from l2dgs_jax.types import Camera, MovedGaussians, RenderOutput, Scene
 
 Figures = dict[str, float]
@@ -33,6 +35,8 @@ CONFIG = dataclasses.replace(
 )
 SIZES = {"10k_160x96": (10_000, 160, 96), "50k_480x270": (50_000, 480, 270), "50k_800x450": (50_000, 800, 450)}
 STEPS = {"10k_200x112": (10_000, 200, 112), "40k_400x225": (40_000, 400, 225), "50k_800x450": (50_000, 800, 450)}
+
+_step = jax.jit(train_step, static_argnames=("config", "moving", "pair_capacity"), donate_argnums=0)
 
 
 def rasterizer() -> Figures:
@@ -72,7 +76,7 @@ def folding() -> Figures:
     for scene, count in zip(scenes, counts, strict=True):
         scene["opacities"] = scene["opacities"].at[count:].set(0)
     names = ("means", "quats", "scales", "opacities", "features", "viewmat", "K")
-    capacity = engine.rung(max(int(rasterize(*(s[n] for n in names), width, height).pairs) for s in scenes))
+    capacity = rung(max(int(rasterize(*(s[n] for n in names), width, height).pairs) for s in scenes))
 
     def loss(*x):
         return sum(jnp.vdot(image, image) for image in rasterize(*x, width, height, pair_capacity=capacity)[:3])
@@ -95,7 +99,7 @@ def parts() -> Figures:
     look = lambda p: hexplane.features(p.hexplane, p.gaussians.means, scene.bounds, batch.cameras.time, cfg)
     moved, field = move(params), jax.jit(look)(params)
     channels = jnp.concatenate([moved.illumination[..., None], moved.reflectance, moved.attenuation], axis=-1)
-    capacity = engine.rung(_pairs(moved, batch.cameras, width, height))
+    capacity = rung(_pairs(moved, batch.cameras, width, height))
 
     def draw(moved, channels):
         geometry = (moved.means, moved.quats, moved.scales, moved.opacities)
@@ -112,8 +116,8 @@ def parts() -> Figures:
         hidden, motion = networks.apply_heads(heads, field)
         return motion, networks.apply_ocd(ocd, hidden)
 
-    optimizer = engine.adam(params, state.adam.schedules, CONFIG)
-    adam = jax.jit(lambda params, adam: optimizer.update(params, adam, params))
+    optimizer = adam(params, state.adam.schedules, CONFIG)
+    update = jax.jit(lambda params, adam: optimizer.update(params, adam, params))
     return {
         "hexplane_ms": _with_gradient(look, params),
         "heads_and_ocd_ms": _with_gradient(mlps, params.heads, params.ocd, field),
@@ -122,7 +126,7 @@ def parts() -> Figures:
         "bafe_ms": _with_gradient(networks.apply_bafe, params.bafe, drawn.features[..., 4:]),
         "decompose_and_losses_ms": _with_gradient(judge, drawn.features, params.bafe),
         "plane_regularisers_ms": _with_gradient(hexplane.regularisers, params.hexplane),
-        "adam_ms": best_of(lambda: adam(params, state.adam)),
+        "adam_ms": best_of(lambda: update(params, state.adam)),
     }
 
 
@@ -182,7 +186,7 @@ def _rasterizer(count: int, width: int, height: int) -> tuple[Callable, Callable
     learned = tuple(arrays[name] for name in ("means", "quats", "scales", "opacities", "features"))
     camera = (arrays["viewmat"], arrays["K"])
     pairs = int(rasterize(*learned, *camera, width, height).pairs)
-    draw = lambda *x: rasterize(*x, *camera, width, height, pair_capacity=engine.rung(pairs))[:3]
+    draw = lambda *x: rasterize(*x, *camera, width, height, pair_capacity=rung(pairs))[:3]
     weights = jax.tree.map(lambda x: jax.random.normal(jax.random.key(0), x.shape), jax.eval_shape(draw, *learned))
 
     def loss(*x):
@@ -207,11 +211,11 @@ def _stepper(count: int, width: int, height: int, margin: float = 1.1) -> Callab
     """Takes the next training step at every call; the pair buffer holds `margin` times what the first one needs."""
     state, batch = training(count, width, height, CONFIG)
     moved = _move(state.scene, batch.cameras)
-    capacity = engine.rung(margin * _pairs(moved, batch.cameras, width, height))
+    capacity = rung(margin * _pairs(moved, batch.cameras, width, height))
 
     def take():
         nonlocal state
-        state, report = engine.train_step(state, batch, CONFIG, moving=True, pair_capacity=capacity)
+        state, report = _step(state, batch, CONFIG, moving=True, pair_capacity=capacity)
         if report.overflow or not report.finite:
             raise RuntimeError("the measured step was refused")
         return report
@@ -234,8 +238,8 @@ def _first_step(folder: str, stage: str) -> None:
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
     state, batch = training(7_000, 200, 112, CONFIG)
     start = time.perf_counter()
-    moving, capacity = stage == "fine", engine.rung(200_000)
-    jax.block_until_ready(engine.train_step(state, batch, CONFIG, moving=moving, pair_capacity=capacity))
+    moving, capacity = stage == "fine", rung(200_000)
+    jax.block_until_ready(_step(state, batch, CONFIG, moving=moving, pair_capacity=capacity))
     print(time.perf_counter() - start)
 
 

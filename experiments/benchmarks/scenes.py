@@ -9,8 +9,8 @@ from jax.scipy.special import logit
 from l2dgs_jax import engine
 from l2dgs_jax.config import Config
 from l2dgs_jax.data.dataset import Dataset, Split
-from l2dgs_jax.engine import Batch, TrainState
 from l2dgs_jax.scene import pad_rows
+from l2dgs_jax.step import Batch, TrainState, begin_stage
 from l2dgs_jax.types import Camera
 
 
@@ -64,5 +64,5 @@ def training(count: int, width: int, height: int, config: Config, *, frames: int
         logit_opacities=rows(logit(arrays["opacities"])),
     )
     scene = scene._replace(params=scene.params._replace(gaussians=gaussians))
-    state = engine.begin_stage(scene, jnp.asarray(config.coarse_steps, jnp.int32), config, config.fine_steps)
+    state = begin_stage(scene, jnp.asarray(config.coarse_steps, jnp.int32), config, config.fine_steps)
     return state, engine.load_batch(split, np.linspace(0, frames - 1, config.batch_size).astype(int))

@@ -1,0 +1,67 @@
+"""The devices that a training is spread over, in one process or several."""
+
+from collections.abc import Iterator
+from typing import TypeVar
+
+import jax
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jaxtyping import Array, PyTree
+
+# Axes of a mesh: members of an ensemble, and views of a batch.
+MEMBERS, VIEWS = "members", "views"
+
+T = TypeVar("T")
+
+
+def mesh(members: int = 1, views: int = 1) -> Mesh | None:
+    """The first `members` x `views` devices of all processes; None if that is one device of one.
+
+    Raises:
+        ValueError: there are not that many, or a process would be left without.
+    """
+    count, found = members * views, jax.devices()
+    if count == 1 and jax.process_count() == 1:
+        return None
+    if count > len(found):
+        raise ValueError(f"{count} devices are wanted, {len(found)} found")
+    used = found[:count]
+    if len({device.process_index for device in used}) < jax.process_count():
+        raise ValueError(f"{count} devices leave some of the {jax.process_count()} processes without any")
+    return Mesh(np.array(used).reshape(members, views), (MEMBERS, VIEWS))
+
+
+def place(tree: PyTree, mesh: Mesh | None, *axes: str) -> PyTree:
+    """Host arrays as arrays whose first axes are spread over those of the mesh; every process has the whole arrays."""
+    if mesh is None:
+        return tree
+    sharding = NamedSharding(mesh, PartitionSpec(*axes))
+
+    def spread(x: np.ndarray) -> Array:
+        x = np.asarray(x)
+        x = x.astype(jax.dtypes.canonicalize_dtype(x.dtype), copy=False)
+        return jax.make_array_from_callback(x.shape, sharding, lambda index: x[index])
+
+    return jax.tree.map(spread, tree)
+
+
+def row(tree: T, index: int) -> T:
+    """Row `index` of all arrays of a tree, for which this process must hold it (see `own_rows`)."""
+
+    def pick(x: Array) -> Array:
+        for shard in x.addressable_shards:
+            rows = range(*shard.index[0].indices(x.shape[0]))
+            if index in rows:
+                return shard.data[index - rows.start]
+        raise KeyError(f"row {index} lies in another process")
+
+    return jax.tree.map(pick, tree)
+
+
+def own_rows(array: Array) -> Iterator[int]:
+    """The rows that are this process's to report on: those that it holds and no process before it."""
+    holders: dict[int, int] = {}
+    for shard in array.global_shards:
+        for index in range(*shard.index[0].indices(array.shape[0])):
+            holders[index] = min(shard.device.process_index, holders.get(index, shard.device.process_index))
+    return (index for index, holder in sorted(holders.items()) if holder == jax.process_index())
