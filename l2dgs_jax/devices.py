@@ -37,10 +37,9 @@ def place(tree: PyTree, mesh: Mesh | None, *axes: str) -> PyTree:
         return tree
     sharding = NamedSharding(mesh, PartitionSpec(*axes))
 
-    def spread(x: np.ndarray) -> Array:
-        x = np.asarray(x)
-        x = x.astype(jax.dtypes.canonicalize_dtype(x.dtype), copy=False)
-        return jax.make_array_from_callback(x.shape, sharding, lambda index: x[index])
+    def spread(leaf: np.ndarray | Array) -> Array:
+        whole = np.asarray(leaf, jax.dtypes.canonicalize_dtype(leaf.dtype))
+        return jax.make_array_from_callback(whole.shape, sharding, lambda index: whole[index])
 
     return jax.tree.map(spread, tree)
 

@@ -53,7 +53,11 @@ class Progress(NamedTuple):
 
 
 class DivergedError(ArithmeticError):
-    """The loss or a gradient of every member is not finite."""
+    """The loss or a gradient of every member is not finite. `progress` is the step that found the last of them so."""
+
+    def __init__(self, message: str, progress: Progress):
+        super().__init__(message)
+        self.progress = progress
 
 
 def split_darkening(split: Split, config: Config) -> Darkening:
@@ -132,8 +136,7 @@ def run(members: Sequence[Member], pair_capacity: int | None = None, mesh: Mesh 
             states, again, tally = take(states, batches, values, step, pair_capacity=pair_capacity)
             report = jax.tree.map(partial(jnp.where, report.overflow), again, report)
         if not tally.left:
-            raise DivergedError(_complaint(report, step))
-
+            raise DivergedError(_complaint(report, step), Progress(step + 1, states, report, pair_capacity))
         if density_due(step + 1 - stage_start, config):
             states = densify_all(states, values, step + 1, config=config, mesh=mesh)
         yield Progress(step + 1, states, report, pair_capacity)

@@ -27,9 +27,9 @@ class Recorder:
         step, config = progress.step, self.config
         last = step == config.steps
         if step == config.coarse_steps:
-            self._save(progress, member, runs.COARSE)
+            self.save(progress, member, runs.COARSE)
         if step % config.checkpoint_every == 0 or last:
-            self._save(progress, member, runs.CHECKPOINT)
+            self.save(progress, member, runs.CHECKPOINT)
         if step % LOG_EVERY and not last:
             return None
         report = devices.row(progress.report, member)
@@ -47,6 +47,7 @@ class Recorder:
             file.write(json.dumps(line) + "\n")
         return line
 
-    def _save(self, progress: Progress, member: int, name: str) -> None:
+    def save(self, progress: Progress, member: int, name: str) -> None:
+        """Write the member's state to the file of that name in the run folder."""
         state = devices.row(progress.states, member)
         checkpoint.save(self.folder / name, Checkpoint(state, progress.pair_capacity), self.config)

@@ -9,7 +9,7 @@ from l2dgs_jax.config import Config, from_dict, to_dict
 from l2dgs_jax.data import load
 from l2dgs_jax.data.dataset import Dataset
 from l2dgs_jax.errors import UserError
-from l2dgs_jax.files import replacing
+from l2dgs_jax.files import make_folder, replacing
 from l2dgs_jax.rendering import Renderer
 from l2dgs_jax.step import TrainState, sh_degree
 
@@ -60,10 +60,7 @@ def write_settings(folder: Path, scene: str, config: Config) -> None:
     Raises:
         UserError: the folder cannot be made or written to.
     """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UserError(f"{folder}: cannot be made ({error.strerror}); expected a writable place") from None
+    make_folder(folder)
     with replacing(folder / SETTINGS) as temporary:
         temporary.write_text(json.dumps({"scene": scene, "settings": to_dict(config)}, indent=2) + "\n")
 

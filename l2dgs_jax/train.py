@@ -1,19 +1,24 @@
 """`python -m l2dgs_jax.train SCENE`: train a scene and leave a run folder with checkpoints, metrics and pictures."""
 
 import dataclasses
+from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
+import jax
 import tyro
+from jax.sharding import Mesh
 from tqdm import tqdm
 
-from l2dgs_jax import checkpoint, cli, engine, runs, visualize
+from l2dgs_jax import checkpoint, cli, devices, engine, hosts, runs, visualize
 from l2dgs_jax.config import PRESETS, Config
 from l2dgs_jax.data import load
+from l2dgs_jax.data.dataset import Dataset
 from l2dgs_jax.data.images import write_image
 from l2dgs_jax.errors import UserError
+from l2dgs_jax.hosts import Hosts
 from l2dgs_jax.recording import Recorder
 
 
@@ -26,35 +31,56 @@ class Train:
         preset: settings to start from (default, paper, authors or demo); the options below override single ones.
         output: run folder; a fresh one under runs/ if not given.
         resume: continue the run in the output folder from its last checkpoint.
+        devices: how many devices the views of a step are spread over.
+        hosts: several processes.
     """
 
     scene: tyro.conf.Positional[str]
     preset: str | None = None
     output: Path | None = None
     resume: bool = False
+    devices: int = 1
+    hosts: Annotated[Hosts, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Hosts)
     config: Annotated[Config, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Config)
 
 
 def train(arguments: Sequence[str]) -> None:
     """Train as the command line says."""
     options = _parse(arguments)
+    with hosts.together(options.hosts):
+        hosts.meet("the options are checked")
+        _train(options)
+
+
+def _train(options: Train) -> None:
     folder, config = options.output, options.config
     assert folder is not None
+    mesh = _mesh(options)
     dataset = load(options.scene, config.downscale, config.format, config.held_out)
     config = engine.resolve(config, dataset.train)
     state, pair_capacity = engine.initial_state(dataset, config), None
     if options.resume:
         state, pair_capacity = checkpoint.load(folder / runs.CHECKPOINT, config, state)
+    hosts.meet("everything is read")
+    steps = engine.run([engine.Member(dataset.train, config, state)], pair_capacity, mesh)
+    if jax.process_index() > 0:
+        deque(steps, maxlen=0)
     else:
-        runs.write_settings(folder, options.scene, config)
+        _record(steps, dataset, options, config, done=int(state.step))
+    hosts.meet("the run is finished")
 
+
+def _record(steps: Iterator[engine.Progress], dataset: Dataset, options: Train, config: Config, done: int) -> None:
+    """Take the steps of a training, leave them in the run folder, and show what came of them."""
+    folder = options.output
+    assert folder is not None
+    if not options.resume:
+        runs.write_settings(folder, options.scene, config)
     for note in dataset.notes:
         print(f"note: {note}")
     print(f"{dataset.name}: {len(dataset.train.names)} frames of {dataset.width}x{dataset.height}; run folder {folder}")
-    start = int(state.step)
     try:
-        member = engine.Member(dataset.train, config, state)
-        _consume(engine.run([member], pair_capacity), folder, config, start)
+        _consume(steps, folder, config, done)
     except engine.DivergedError as error:
         raise UserError(
             f"{folder}: {error}; expected finite values: lower the learning rates and --resume from the checkpoint"
@@ -65,6 +91,17 @@ def train(arguments: Sequence[str]) -> None:
     visualize.video(run, folder / runs.VIDEO)
     print(f"wrote {folder / runs.CONTACT_SHEET} and {folder / runs.VIDEO}")
     print(f"next: python -m l2dgs_jax.evaluate {folder}   or   python -m l2dgs_jax.render {folder}")
+
+
+def _mesh(options: Train) -> Mesh | None:
+    """The devices that the views of a step are spread over."""
+    views = options.config.batch_size
+    if options.devices < 1 or views % options.devices:
+        raise UserError(f"--devices {options.devices}: expected a number that divides --batch-size, which is {views}")
+    try:
+        return devices.mesh(views=options.devices)
+    except ValueError as error:
+        raise UserError(f"--devices {options.devices}: {error}; expected what there is") from None
 
 
 def _parse(arguments: Sequence[str]) -> Train:

@@ -25,7 +25,7 @@ OTHER = {
     "loss.amplification": 0.1,
     "optim.planes_lr": 1e-3,
     "model.initial_exponents": (2.5, 8.0),
-    "density.grad_threshold": 1e-3,
+    "density.max_gaussians": 45,
 }
 
 
@@ -35,7 +35,11 @@ def member(seed, changes=()):
     valid = np.random.default_rng(seed).random((FRAMES, HEIGHT, WIDTH)) < 0.7
     config = overrides.replace(CONFIG, dict(changes))
     start = engine.initial_state(dataset, CONFIG)
-    state = jax.jit(step.begin_stage, static_argnums=(2, 3))(start.scene, start.step, config, STEPS)
+    # Round Gaussians have no gradient in their quaternions but rounding noise, which Adam magnifies.
+    gaussians = start.scene.params.gaussians
+    uneven = gaussians._replace(log_scales=gaussians.log_scales - jnp.array([[0.0, 0.5, 1.0]]))
+    scene = start.scene._replace(params=start.scene.params._replace(gaussians=uneven))
+    state = jax.jit(step.begin_stage, static_argnums=(2, 3))(scene, start.step, config, STEPS)
     return engine.Member(dataclasses.replace(dataset.train, valid=valid), config, state)
 
 
@@ -55,13 +59,12 @@ def alone(members):
 
 
 def assert_same_training(progress, index, alone):
-    """Round Gaussians have no gradient in their quaternions but rounding noise, which Adam magnifies."""
     state, expected = devices.row(progress.states, index), devices.row(alone.states, 0)
     rows = len(expected.scene.alive)
     np.testing.assert_array_equal(state.scene.alive[:rows], expected.scene.alive)
     assert not state.scene.alive[rows:].any()
     for x, y in zip(*(jax.tree.leaves(s.scene.params) for s in (state, expected)), strict=True):
-        np.testing.assert_allclose(x[: len(y)], y, rtol=1e-5, atol=2e-5)
+        np.testing.assert_allclose(x[: len(y)], y, rtol=1e-6, atol=1e-6)
     np.testing.assert_allclose(progress.report.loss[index], alone.report.loss[0], rtol=1e-6)
     np.testing.assert_allclose(progress.report.psnr[index], alone.report.psnr[0], rtol=1e-6)
     assert state.step == expected.step
@@ -71,7 +74,7 @@ def test_each_member_trains_as_if_it_were_alone(members, alone):
     compiled = engine.train_steps._cache_size()
     together = last(members)
     assert engine.train_steps._cache_size() == compiled + 1
-    assert 25 < alone[0].states.scene.alive.sum() == 60 > alone[1].states.scene.alive.sum()
+    assert [int(progress.states.scene.alive.sum()) for progress in alone] == [60, 45, 60]
     for index, expected in enumerate(alone):
         assert_same_training(together, index, expected)
 
@@ -139,17 +142,19 @@ def test_every_setting_that_members_may_differ_in_can_be_traced(members):
     assert set(values) == overrides.TRACED
 
     @jax.jit
-    def traced(state, values):
+    def traced(state, batch, values):
         own = overrides.replace(_all_changed(config), values)
         fresh = step.begin_stage(state.scene, state.step, own, 9)
         return step.densify(step.train_step(fresh, batch, own, moving=True, pair_capacity=4096)[0], own)
 
     @jax.jit
-    def compiled_in(state):
+    def compiled_in(state, batch):
         fresh = step.begin_stage(state.scene, state.step, config, 9)
         return step.densify(step.train_step(fresh, batch, config, moving=True, pair_capacity=4096)[0], config)
 
-    for x, y in zip(*map(jax.tree.leaves, (traced(one.state, values), compiled_in(one.state))), strict=True):
+    for x, y in zip(
+        *map(jax.tree.leaves, (traced(one.state, batch, values), compiled_in(one.state, batch))), strict=True
+    ):
         np.testing.assert_allclose(x, y, rtol=1e-6, atol=1e-8)
 
 

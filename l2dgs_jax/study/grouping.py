@@ -1,0 +1,67 @@
+"""Which members of a study one compiled program can train together."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from l2dgs_jax import engine, overrides
+from l2dgs_jax.config import Config
+from l2dgs_jax.data import load
+from l2dgs_jax.data.dataset import Dataset
+from l2dgs_jax.errors import UserError
+from l2dgs_jax.study.spec import Plan, Spec
+
+
+@dataclass(frozen=True)
+class Entrant:
+    """A member of a study with its data loaded and its settings resolved."""
+
+    plan: Plan
+    dataset: Dataset
+    config: Config
+
+
+def enter(spec: Spec) -> list[list[Entrant]]:
+    """Load every scene once and put those members together that one program can train.
+
+    Members of a group have images of one size, planes of one size, and settings that differ in nothing but the
+    numbers of `overrides.TRACED`.
+
+    Raises:
+        UserError: a scene cannot be read, or the study insists on one program and there cannot be one.
+    """
+    datasets: dict[tuple, Dataset] = {}
+    groups: dict[tuple, list[Entrant]] = {}
+    for plan in spec.plans:
+        c = plan.config
+        source = (plan.scene, c.downscale, c.format, c.held_out)
+        if source not in datasets:
+            datasets[source] = load(*source)
+        dataset = datasets[source]
+        entrant = Entrant(plan, dataset, engine.resolve(c, dataset.train))
+        groups.setdefault((overrides.outline(entrant.config), *_shapes(entrant).values()), []).append(entrant)
+    if spec.one_program and len(groups) > 1:
+        raise UserError(_difference(list(groups.values())))
+    return list(groups.values())
+
+
+def _shapes(entrant: Entrant) -> dict[str, object]:
+    dataset, config = entrant.dataset, entrant.config
+    return {
+        "image size": f"{dataset.width}x{dataset.height}",
+        "number of training frames": len(dataset.train.names) if config.model.time_size is None else None,
+        "having pixels that do not count": dataset.train.valid is not None,
+    }
+
+
+def _difference(groups: Sequence[Sequence[Entrant]]) -> str:
+    """Why the first members of the first two groups cannot be trained together."""
+    a, b = groups[0][0], groups[1][0]
+    shapes = [(name, x, _shapes(b)[name]) for name, x in _shapes(a).items() if x != _shapes(b)[name]]
+    settings = overrides.differences([overrides.outline(a.config), overrides.outline(b.config)])
+    name, *values = shapes[0] if shapes else next((name, *values) for name, values in settings.items())
+    names = f"{a.plan.name} ({Path(a.plan.scene).name}) and {b.plan.name} ({Path(b.plan.scene).name})"
+    return (
+        f"{names} cannot share one program: {name} is {values[0]} and {values[1]}; expected members that agree in it, "
+        "or a study without one_program"
+    )

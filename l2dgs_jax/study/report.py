@@ -1,0 +1,88 @@
+"""What came out of a study: one table of all members, as JSON, as Markdown and as plots."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from l2dgs_jax import runs
+from l2dgs_jax.files import replacing
+
+JSON, MARKDOWN, PLOTS = "results.json", "results.md", "results.png"
+RESULT = "result.json"  # in the folder of a member
+
+_SCORES = {
+    "low-light PSNR": ("lowlight", "psnr"),
+    "low-light SSIM": ("lowlight", "ssim"),
+    "well-lit PSNR": ("welllit", "overall", "psnr"),
+    "after one gain": ("welllit", "overall", "psnr_gain"),
+    "well-lit SSIM": ("welllit", "overall", "ssim"),
+}
+
+
+def write(folder: Path, names: Sequence[str]) -> list[str]:
+    """Collect the members' results in the study's folder; the names of the files written.
+
+    Raises:
+        UserError: the folder cannot be written to.
+    """
+    members = [{"name": name, **json.loads((folder / name / RESULT).read_text())} for name in names]
+    with replacing(folder / JSON) as temporary:
+        temporary.write_text(json.dumps({"members": members}, indent=2) + "\n")
+    with replacing(folder / MARKDOWN) as temporary:
+        temporary.write_text(markdown(members))
+    try:
+        import matplotlib  # noqa: F401
+    except ModuleNotFoundError:
+        return [JSON, MARKDOWN]
+    with replacing(folder / PLOTS) as temporary:
+        _plot(temporary, members, folder)
+    return [JSON, MARKDOWN, PLOTS]
+
+
+def markdown(members: Sequence[dict[str, Any]]) -> str:
+    """A table with a row for each member: what was varied, how it ended, and the scores that it has."""
+    varied = list(dict.fromkeys(name for member in members for name in member["varied"]))
+    shown = [name for name, path in _SCORES.items() if any(_score(member, path) is not None for member in members)]
+    header = ["scene", *varied, "ended", "Gaussians", *shown]
+    lines = [header, ["---"] * len(header)]
+    for member in members:
+        scores = [_score(member, _SCORES[name]) for name in shown]
+        cells = [Path(member["scene"]).name, *(_text(member["varied"].get(name)) for name in varied)]
+        cells += [member["ended"], str(member["scores"]["gaussians"])]
+        lines.append(cells + ["" if score is None else f"{score:.3f}" for score in scores])
+    return "".join(f"| {' | '.join(cells)} |\n" for cells in lines)
+
+
+def _score(member: dict[str, Any], path: Sequence[str]) -> float | None:
+    found: Any = member["scores"]
+    for key in path:
+        found = found.get(key) if isinstance(found, dict) else None
+    return found
+
+
+def _text(value: Any) -> str:
+    return "" if value is None else str(value)
+
+
+def _plot(path: Path, members: Sequence[dict[str, Any]], folder: Path) -> None:
+    """The members' loss and low-light PSNR while they trained, and their scores side by side."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(15, max(4, 0.3 * len(members))), layout="constrained")
+    over_time, ends = figure.subplots(1, 2, width_ratios=(3, 2))
+    for member in members:
+        lines = [json.loads(line) for line in (folder / member["name"] / runs.METRICS).read_text().splitlines()]
+        over_time.plot([line["step"] for line in lines], [line["psnr"] for line in lines], label=member["name"])
+    over_time.set(xlabel="step", ylabel="low-light PSNR of the step's views, dB")
+    over_time.legend(fontsize=6)
+    shown = [name for name, path in _SCORES.items() if path[-1].startswith("psnr")]
+    for offset, name in enumerate(shown):
+        values = [_score(member, _SCORES[name]) or 0 for member in members]
+        places = [index + 0.8 * offset / len(shown) for index in range(len(members))]
+        ends.barh(places, values, height=0.8 / len(shown), label=name)
+    ends.set(xlabel="held-out views, dB", yticks=range(len(members)))
+    ends.set_yticklabels([member["name"] for member in members], fontsize=6)
+    ends.invert_yaxis()
+    ends.legend(fontsize=6)
+    figure.savefig(path, dpi=120, format="png")

@@ -1,0 +1,152 @@
+"""The file that describes a study, and the members that it stands for."""
+
+import itertools
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from l2dgs_jax import overrides
+from l2dgs_jax.config import PRESETS, Config
+from l2dgs_jax.errors import UserError
+
+KEYS = ("scenes", "seeds", "preset", "settings", "grid", "variants", "one_program")
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A member of a study before anything is loaded.
+
+    Attributes:
+        name: unique, fit for a folder's name.
+        scene: its folder, or "demo".
+        config: its settings.
+        varied: the settings that the study varies, by dotted name, with this member's values.
+    """
+
+    name: str
+    scene: str
+    config: Config
+    varied: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Spec:
+    """A study: its members, and whether it insists that one compiled program trains them all."""
+
+    plans: tuple[Plan, ...]
+    one_program: bool
+
+
+def read(path: Path) -> Spec:
+    """Read a study from a TOML file.
+
+    Its keys: `scenes` (folders, seen from the file's own, or "demo"), `seeds` ([0] if not given), `preset` ("default"),
+    `[settings]` for all members, `[grid]` with a list of values for each setting, of which every combination is a
+    member, `[[variants]]` with a `name` and settings each, and `one_program`. Members are all scenes x seeds x
+    combinations x variants.
+
+    Raises:
+        UserError: the file cannot be read, or a key or value in it is none of these.
+    """
+    content = _read_toml(path)
+    unknown = sorted(content.keys() - set(KEYS))
+    if unknown:
+        raise UserError(f"{path}: the key '{unknown[0]}' is unknown; expected {', '.join(KEYS)}")
+    scenes = [_scene(path, scene) for scene in _list(path, content, "scenes", str)]
+    seeds = _list(path, content, "seeds", int) if "seeds" in content else [0]
+    preset = content.get("preset", "default")
+    if preset not in PRESETS:
+        raise UserError(f"{path}: no preset is called {preset!r}; expected one of {', '.join(PRESETS)}")
+    one_program = content.get("one_program", False)
+    if not isinstance(one_program, bool):
+        raise UserError(f"{path}: one_program is {one_program!r}; expected true or false")
+    settings = _settings(path, "settings", content.get("settings", {}))
+    grid = _grid(path, content.get("grid", {}))
+    variants = _variants(path, content.get("variants", [{}]))
+
+    plans: list[Plan] = []
+    for scene, seed, point, (label, variant) in itertools.product(scenes, seeds, grid, variants):
+        varied = {"seed": seed, **point, **variant}
+        config = overrides.replace(PRESETS[preset], settings | varied)
+        if config.steps < 1 or min(config.coarse_steps, config.fine_steps) < 0:
+            raise UserError(f"{path}: coarse_steps and fine_steps must not be negative, and one step at least in all")
+        parts = [f"{len(plans):02d}", Path(scene).name, f"seed{seed}", *_labels(point), *([label] if label else [])]
+        plans.append(Plan("-".join(parts), scene, config, varied))
+    return Spec(tuple(plans), one_program)
+
+
+def _read_toml(path: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(path.read_text())
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read ({error.strerror}); expected a TOML file") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise UserError(f"{path}: is no TOML ({error}); expected a file like the one in the README") from None
+
+
+def _list(path: Path, content: dict[str, Any], key: str, kind: type) -> list:
+    """The distinct values of a list that must hold some, all of one type."""
+    values: Any = content.get(key)
+    name = {str: "names", int: "whole numbers from 0 below 2^31"}[kind]
+    fits = lambda v: isinstance(v, kind) and not isinstance(v, bool) and (kind is str or v in range(2**31))
+    if not isinstance(values, list) or not values or not all(map(fits, values)) or len(set(values)) < len(values):
+        raise UserError(f"{path}: {key} is {values!r}; expected a list of different {name}, at least one")
+    return values
+
+
+def _scene(path: Path, scene: str) -> str:
+    return scene if scene == "demo" else str((path.parent / Path(scene).expanduser()).absolute())
+
+
+def _flat(table: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested tables by dotted names."""
+    flat: dict[str, Any] = {}
+    for key, value in table.items():
+        flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
+    return flat
+
+
+def _settings(path: Path, key: str, table: Any) -> dict[str, Any]:
+    if not isinstance(table, dict):
+        raise UserError(f"{path}: {key} is {table!r}; expected a table of settings")
+    return {name: _checked(path, key, name, value) for name, value in _flat(table).items()}
+
+
+def _checked(path: Path, key: str, name: str, value: Any) -> Any:
+    if name == "seed":
+        raise UserError(f"{path}: [{key}] sets the seed; expected the key seeds")
+    try:
+        return overrides.checked(name, value)
+    except ValueError as error:
+        raise UserError(f"{path}: [{key}] {error}") from None
+
+
+def _grid(path: Path, table: Any) -> list[dict[str, Any]]:
+    """Every combination of the values that the settings of a table have."""
+    if not isinstance(table, dict):
+        raise UserError(f"{path}: grid is {table!r}; expected a table with a list of values for each setting")
+    columns = []
+    for name, values in _flat(table).items():
+        if not isinstance(values, list) or not values:
+            raise UserError(f"{path}: [grid] {name} is {values!r}; expected a list of values, at least one")
+        columns.append([(name, _checked(path, "grid", name, value)) for value in values])
+    return [dict(point) for point in itertools.product(*columns)]
+
+
+def _variants(path: Path, tables: Any) -> list[tuple[str, dict[str, Any]]]:
+    """Names of the variants and their settings; a single one without any if there are none."""
+    if tables == [{}]:
+        return [("", {})]
+    named = isinstance(tables, list) and all(isinstance(t, dict) and isinstance(t.get("name"), str) for t in tables)
+    names = [table["name"] for table in tables] if named else []
+    if not names or len(set(names)) < len(names) or not all(name.replace("_", "").isalnum() for name in names):
+        raise UserError(f"{path}: every one of [[variants]] must have a name of its own, of letters, digits and _")
+    rest = [{key: value for key, value in table.items() if key != "name"} for table in tables]
+    return [(name, _settings(path, f"variants.{name}", table)) for name, table in zip(names, rest, strict=True)]
+
+
+def _labels(point: dict[str, Any]) -> list[str]:
+    """What a combination is called in a folder's name."""
+    text = lambda value: "_".join(map(str, value)) if isinstance(value, tuple) else str(value)
+    return [f"{name.split('.')[-1]}{text(value)}" for name, value in point.items()]
