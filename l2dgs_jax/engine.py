@@ -232,7 +232,7 @@ def _each_member(function: Callable, mesh: Mesh | None, step: Int[Array, ""] | i
 
     def here(step, *trees):
         if len(jax.tree.leaves(trees)[0]) > 1:
-            return jax.vmap(partial(function, step))(*trees)
+            return jax.lax.map(lambda row: function(step, *row), trees)
         alone = function(step, *jax.tree.map(lambda x: x.squeeze(0), trees))
         return jax.tree.map(lambda x: x[None], alone)
 

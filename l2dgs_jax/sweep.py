@@ -52,6 +52,8 @@ class Sweep:
 def main(arguments: Sequence[str]) -> None:
     """Sweep as the command line says."""
     options = cli.parse(Sweep, arguments, "sweep")
+    if options.devices is not None and options.devices < 1:
+        raise UserError(f"--devices {options.devices}: expected at least one")
     with hosts.together(options.hosts):
         sweep(read(options.spec), options.output, resume=options.resume, device_count=options.devices)
 
