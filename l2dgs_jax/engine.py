@@ -15,6 +15,7 @@ from l2dgs_jax import density, hexplane, losses, networks, optim
 from l2dgs_jax.config import Config
 from l2dgs_jax.data.batching import view_indices
 from l2dgs_jax.data.dataset import Dataset, Split
+from l2dgs_jax.data.stacks import pixel_mean
 from l2dgs_jax.density import GrowthStats
 from l2dgs_jax.rasterizer import count_pairs
 from l2dgs_jax.rendering import render
@@ -185,8 +186,8 @@ def adam(params: SceneParams, rates: dict[str, optim.Schedule], config: Config) 
 
 def split_darkening(split: Split, config: Config) -> Darkening:
     """How the frames are darker than `config.loss.exposure_level`."""
-    counted = True if split.valid is None else split.valid[..., None]
-    return darkening(float(split.images.mean(dtype=np.float64, where=counted)), config.loss.exposure_level)
+    level = np.mean(pixel_mean(split.images, split.valid))
+    return darkening(float(level), config.loss.exposure_level)
 
 
 def resolve(config: Config, split: Split) -> Config:

@@ -13,6 +13,7 @@ from jaxtyping import Float, Shaped
 
 from l2dgs_jax import cli, metrics, runs
 from l2dgs_jax.data.dataset import Split
+from l2dgs_jax.data.stacks import pixel_mean
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.files import replacing
 from l2dgs_jax.metrics import RegionScore
@@ -74,7 +75,7 @@ def evaluate(run: Run, split_name: str = "test") -> dict:
         UserError: the split has no views, or they have no valid pixel.
     """
     split = choose_split(run, split_name)
-    if split.valid is not None and not split.valid.any():
+    if split.valid is not None and not any(frame.any() for frame in split.valid):
         raise UserError(f"{run.folder}: no pixel of its scene's {split_name} views is valid; expected some to score")
     lowlight, welllit = [], []
     for index, output in enumerate(views(run, split)):
@@ -94,7 +95,7 @@ def evaluate(run: Run, split_name: str = "test") -> dict:
     if split.masks is not None or split.covisible is not None:
         result["lowlight_regions"] = scores
     if split.masks is not None:
-        result["mask_area"] = float(split.masks.mean(where=True if split.valid is None else split.valid))
+        result["mask_area"] = float(pixel_mean(split.masks, split.valid))
     if split.welllit is not None:
         plain, gained, gain = _with_gain(np.stack(welllit), split.welllit, split)
         result |= {"welllit": {region: plain[region] | gained[region] for region in plain}, "gain": gain}

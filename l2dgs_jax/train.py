@@ -44,7 +44,7 @@ def train(arguments: Sequence[str]) -> None:
     options = _parse(arguments)
     folder, config = options.output, options.config
     assert folder is not None
-    dataset = load(options.scene, config.downscale, config.format, config.held_out)
+    dataset = load(options.scene, config.downscale, config.format, config.held_out, config.frame_memory)
     config = engine.resolve(config, dataset.train)
     state, pair_capacity = engine.initial_state(dataset, config), None
     if options.resume:

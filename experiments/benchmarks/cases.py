@@ -21,7 +21,8 @@ from l2dgs_jax.config import PRESETS
 from l2dgs_jax.decomposition import decompose
 from l2dgs_jax.deformation import deform
 from l2dgs_jax.rasterizer import count_pairs, rasterize
-from l2dgs_jax.rendering import Renderer, in_order
+from l2dgs_jax.rendering import Renderer
+from l2dgs_jax.threads import in_order
 from l2dgs_jax.types import Camera, MovedGaussians, RenderOutput, Scene
 
 Figures = dict[str, float]

@@ -1,7 +1,34 @@
-"""The order in which training sees its views."""
+"""The order in which training sees its views, and reading them ahead of their use."""
+
+from collections.abc import Callable, Iterable, Iterator
+from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Int
+
+from l2dgs_jax.threads import in_order
+
+T = TypeVar("T")
+
+
+def batches(
+    load: Callable[[Int[np.ndarray, " B"]], T], steps: Iterable[int], seed: int, batch_size: int, num_frames: int
+) -> Iterator[T]:
+    """The batch of each of `steps`, read a few steps ahead on threads, so that no step waits for a disk.
+
+    Close the iterator to end the threads before the last step.
+
+    Args:
+        load: reads the views of given indices; must not depend on the order of its calls.
+        steps: of the run, in order.
+        seed: see `view_indices`.
+        batch_size: see `view_indices`.
+        num_frames: see `view_indices`.
+
+    Raises:
+        Exception: what `load` raises, in the place of the batch.
+    """
+    return in_order(lambda step: load(view_indices(seed, step, batch_size, num_frames)), steps)
 
 
 def view_indices(seed: int, step: int, batch_size: int, num_frames: int) -> Int[np.ndarray, " B"]:
