@@ -1,8 +1,12 @@
+import itertools
+import threading
+
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from l2dgs_jax.data.batching import view_indices
+from l2dgs_jax.data.batching import batches, view_indices
 
 sizes = st.integers(1, 7)
 
@@ -26,3 +30,43 @@ def test_a_resumed_run_sees_the_same_views(seed, step, num_frames):
 def test_order_depends_on_seed_and_epoch():
     orders = {tuple(view_indices(seed, epoch, 20, 20)) for seed in range(3) for epoch in range(3)}
     assert len(orders) == 9
+
+
+def test_batches_are_those_of_the_steps_in_order():
+    found = list(batches(lambda indices: indices, range(3, 12), seed=5, batch_size=2, num_frames=7))
+    assert len(found) == 9
+    for step, indices in enumerate(found, start=3):
+        np.testing.assert_array_equal(indices, view_indices(5, step, 2, 7))
+
+
+def test_the_next_batches_are_read_while_one_is_used():
+    read = [threading.Event() for _ in range(6)]
+    places = {tuple(view_indices(0, step, 1, 6)): step for step in range(6)}
+
+    def load(indices):
+        step = places[tuple(indices)]
+        read[step].set()
+        return step
+
+    found = batches(load, range(6), seed=0, batch_size=1, num_frames=6)
+    assert next(found) == 0
+    assert read[1].wait(10)  # though nobody has asked for it
+    assert read[2].wait(10)
+    assert not read[4].is_set()
+    assert list(found) == [1, 2, 3, 4, 5]
+
+
+def test_an_error_comes_in_the_place_of_its_batch_and_ends_the_threads():
+    before = set(threading.enumerate())
+    bad = view_indices(0, 2, 1, 6).tolist()
+
+    def load(indices):
+        if indices.tolist() == bad:
+            raise OSError("gone")
+        return 0
+
+    found = batches(load, itertools.count(), seed=0, batch_size=1, num_frames=6)
+    assert [next(found), next(found)] == [0, 0]
+    with pytest.raises(OSError, match="gone"):
+        next(found)
+    assert set(threading.enumerate()) == before
