@@ -89,7 +89,7 @@ def assemble(
     if _check_pictures([frame.image for frame in frames], full):
         notes = (*notes, LINEAR_NOTE)
     width, height = full[0] // downscale, full[1] // downscale
-    kinds = 1 + (folder / "well").is_dir()
+    kinds = 1 + (folder / "well").is_dir()  # masks take a sixth of what pictures take
     in_file = kinds * len(frames) * height * width * 3 * np.dtype(np.float16).itemsize > frame_memory * 2**30
     learned, train_notes = _read_split(folder, "train", train, width, height, downscale, in_file)
     held_out, test_notes = _read_split(folder, "val", test, width, height, downscale, in_file)
@@ -191,9 +191,9 @@ def _read_split(
     split = Split(
         names=tuple(names),
         cameras=Camera(
-            viewmat=_stacked([frame.viewmat for frame in frames], frames),
-            K=_stacked(K, frames),
-            time=_stacked([np.array(frame.time) for frame in frames], frames),
+            viewmat=_singles([frame.viewmat for frame in frames], frames),
+            K=_singles(K, frames),
+            time=_singles([np.array(frame.time) for frame in frames], frames),
         ),
         images=lowlight,
         welllit=read_all(folder / "well", masks=False),
@@ -205,7 +205,7 @@ def _read_split(
     return split, notes
 
 
-def _stacked(values: Sequence[np.ndarray], frames: Sequence[Frame]) -> Any:
+def _singles(values: Sequence[np.ndarray], frames: Sequence[Frame]) -> Any:
     """Stacked as float32; `Any` because `Camera` declares jax arrays and these are NumPy's."""
     return np.stack([_single(x, f"{frame.source}: the camera") for x, frame in zip(values, frames, strict=True)])
 
