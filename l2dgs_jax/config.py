@@ -125,6 +125,7 @@ class Config:
     held_out: str = "auto"  # views not trained on: the scene's own, "4dgs", or k for every k-th (data/splits.py)
     sh_warmup: int = 1000  # steps between activating one more SH band
     checkpoint_every: int = 500  # steps
+    frame_memory: float = 4.0  # GiB that a scene's frames may take; beyond it they lie in temporary files
     model: ModelConfig = field(default_factory=ModelConfig)
     loss: LossConfig = field(default_factory=LossConfig)
     optim: OptimConfig = field(default_factory=OptimConfig)
@@ -234,6 +235,9 @@ def _presets() -> dict[str, Config]:
 
 
 PRESETS = _presets()
+
+# Settings of how a run is carried out, not of what it computes: they may change when it goes on.
+EXECUTION = frozenset({"checkpoint_every", "frame_memory"})
 
 
 def to_dict(config: Config) -> dict:

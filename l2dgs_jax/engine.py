@@ -1,5 +1,6 @@
 """The coarse-to-fine loop over one scene or many at once. No input or output: callers consume what `run` yields."""
 
+import contextlib
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
@@ -16,10 +17,12 @@ from l2dgs_jax import devices, networks, overrides
 from l2dgs_jax.config import Config
 from l2dgs_jax.data.batching import view_indices
 from l2dgs_jax.data.dataset import Dataset, Split
+from l2dgs_jax.data.stacks import pixel_mean
 from l2dgs_jax.devices import MEMBERS, VIEWS
 from l2dgs_jax.rasterizer import count_pairs
 from l2dgs_jax.scene import initialise, observed_colors, rung
 from l2dgs_jax.step import Batch, StepReport, TrainState, begin_stage, densify, train_step, with_capacity
+from l2dgs_jax.threads import in_order
 from l2dgs_jax.tone import Darkening, darkening
 from l2dgs_jax.types import Camera, Scene
 
@@ -62,8 +65,8 @@ class DivergedError(ArithmeticError):
 
 def split_darkening(split: Split, config: Config) -> Darkening:
     """How the frames are darker than `config.loss.exposure_level`."""
-    counted = True if split.valid is None else split.valid[..., None]
-    return darkening(float(split.images.mean(dtype=np.float64, where=counted)), config.loss.exposure_level)
+    level = np.mean(pixel_mean(split.images, split.valid))
+    return darkening(float(level), config.loss.exposure_level)
 
 
 def resolve(config: Config, split: Split) -> Config:
@@ -122,24 +125,28 @@ def run(members: Sequence[Member], pair_capacity: int | None = None, mesh: Mesh 
     states = devices.place(_stack_states([member.state for member in members]), mesh, MEMBERS)
     values = devices.place(_differences([member.config for member in members]), mesh, MEMBERS)
 
-    for step in range(start, config.steps):
-        moving = step >= config.coarse_steps
-        stage_start = config.coarse_steps if moving else 0
-        if moving and step == stage_start:
-            states = begin_fine_stage(states, values, step, config=config, mesh=mesh)
+    steps = range(start, config.steps)
+    read = in_order(lambda step: _stack([_next_batch(member, step) for member in members]), steps)
+    with contextlib.closing(read):  # its threads read the next batches while a step is computed
+        for step, batches in zip(steps, read, strict=True):
+            moving = step >= config.coarse_steps
+            stage_start = config.coarse_steps if moving else 0
+            if moving and step == stage_start:
+                states = begin_fine_stage(states, values, step, config=config, mesh=mesh)
 
-        batches = devices.place(_stack([_next_batch(member, step) for member in members]), mesh, MEMBERS, VIEWS)
-        take = partial(train_steps, config=config, moving=moving, mesh=mesh)
-        states, report, tally = take(states, batches, values, step, pair_capacity=pair_capacity)
-        while tally.pairs > pair_capacity:
-            pair_capacity = rung(MARGIN * float(tally.pairs))
-            states, again, tally = take(states, batches, values, step, pair_capacity=pair_capacity)
-            report = jax.tree.map(partial(jnp.where, report.overflow), again, report)
-        if not tally.left:
-            raise DivergedError(_complaint(report, step), Progress(step + 1, states, report, pair_capacity))
-        if density_due(step + 1 - stage_start, config):
-            states = densify_all(states, values, step + 1, config=config, mesh=mesh)
-        yield Progress(step + 1, states, report, pair_capacity)
+            batches = devices.place(batches, mesh, MEMBERS, VIEWS)
+            take = partial(train_steps, config=config, moving=moving, mesh=mesh)
+            states, report, tally = take(states, batches, values, step, pair_capacity=pair_capacity)
+            while tally.pairs > pair_capacity:
+                pair_capacity = rung(MARGIN * float(tally.pairs))
+                states, again, tally = take(states, batches, values, step, pair_capacity=pair_capacity)
+                report = jax.tree.map(partial(jnp.where, report.overflow), again, report)
+            if not tally.left:
+                raise DivergedError(_complaint(report, step), Progress(step + 1, states, report, pair_capacity))
+
+            if density_due(step + 1 - stage_start, config):
+                states = densify_all(states, values, step + 1, config=config, mesh=mesh)
+            yield Progress(step + 1, states, report, pair_capacity)
 
 
 class Tally(NamedTuple):

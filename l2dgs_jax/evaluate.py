@@ -2,17 +2,18 @@
 
 import dataclasses
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import tyro
-from jaxtyping import Float, Shaped
+from jaxtyping import Float, Float16, Shaped
 
 from l2dgs_jax import cli, metrics, runs
 from l2dgs_jax.data.dataset import Split
+from l2dgs_jax.data.stacks import FileStack, pixel_mean, stacked
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.files import replacing
 from l2dgs_jax.metrics import RegionScore
@@ -74,14 +75,17 @@ def evaluate(run: Run, split_name: str = "test") -> dict:
         UserError: the split has no views, or they have no valid pixel.
     """
     split = choose_split(run, split_name)
-    if split.valid is not None and not split.valid.any():
+    if split.valid is not None and not any(frame.any() for frame in split.valid):
         raise UserError(f"{run.folder}: no pixel of its scene's {split_name} views is valid; expected some to score")
-    lowlight, welllit = [], []
-    for index, output in enumerate(views(run, split)):
-        lowlight.append(_compare(output.images.lowlight, split.images, split, index))
-        if split.welllit is not None:
-            welllit.append(np.asarray(output.images.welllit, np.float16))  # as compact as the data set's own images
+    lowlight = []
 
+    def relit() -> Iterator[Float16[np.ndarray, "H W 3"]]:
+        """The well-lit views, as compact as the data set's own; the low-light ones are scored on the way."""
+        for index, output in enumerate(views(run, split)):
+            lowlight.append(_compare(output.images.lowlight, split.images, split, index))
+            yield np.asarray(output.images.welllit, np.float16)
+
+    welllit = stacked(relit(), split.images.shape, np.float16, in_file=isinstance(split.images, FileStack))
     scores = metrics.summarise(lowlight)
     result: dict = {
         "split": split_name,
@@ -94,9 +98,9 @@ def evaluate(run: Run, split_name: str = "test") -> dict:
     if split.masks is not None or split.covisible is not None:
         result["lowlight_regions"] = scores
     if split.masks is not None:
-        result["mask_area"] = float(split.masks.mean(where=True if split.valid is None else split.valid))
+        result["mask_area"] = float(pixel_mean(split.masks, split.valid))
     if split.welllit is not None:
-        plain, gained, gain = _with_gain(np.stack(welllit), split.welllit, split)
+        plain, gained, gain = _with_gain(welllit, split.welllit, split)
         result |= {"welllit": {region: plain[region] | gained[region] for region in plain}, "gain": gain}
         whole = dataclasses.replace(split, masks=None, covisible=None)
         _, gained, gain = _with_gain(split.images, split.welllit, whole)

@@ -4,6 +4,7 @@ import os
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from l2dgs_jax.data import load
 from l2dgs_jax.data.dataset import Dataset, Original
 from l2dgs_jax.data.images import to_bytes, write_image
 from l2dgs_jax.data.lens import distorted
+from l2dgs_jax.data.stacks import FileStack, stacked
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.motion import brightened, moving_masks
 from l2dgs_jax.types import Camera
@@ -158,7 +160,10 @@ def _all_frames(dataset: Dataset) -> tuple[Camera, np.ndarray]:
     """Cameras and images of both splits."""
     both = (dataset.train, dataset.test)
     parts: list[Any] = [np.concatenate(arrays) for arrays in zip(*(split.cameras for split in both), strict=True)]
-    return Camera(*parts), np.concatenate([split.images for split in both])
+    images, others = (split.images for split in both)
+    shape = (len(images) + len(others), *images.shape[1:])
+    in_file = isinstance(images, FileStack) or isinstance(others, FileStack)
+    return Camera(*parts), stacked(chain(images, others), shape, images.dtype, in_file)
 
 
 if __name__ == "__main__":

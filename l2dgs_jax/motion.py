@@ -82,10 +82,11 @@ def moving_masks(
 
 def brightened(images: Float[np.ndarray, "F H W 3"]) -> UInt8[np.ndarray, "F H W"]:
     """Grey copies for matching: noise blurred away, then one stretch of contrast for all frames."""
-    greys = np.stack([cv2.cvtColor(image.astype(np.float32), cv2.COLOR_RGB2GRAY) for image in images])
-    greys = np.stack([cv2.GaussianBlur(grey, (0, 0), BLUR) for grey in greys])
-    low, high = np.percentile(greys[:: max(len(greys) // 16, 1)], (0.5, 99.5))
-    return np.round(255 * np.clip((greys - low) / max(high - low, 1e-6), 0, 1)).astype(np.uint8)
+    smooth = lambda image: cv2.GaussianBlur(cv2.cvtColor(image.astype(np.float32), cv2.COLOR_RGB2GRAY), (0, 0), BLUR)
+    sample = [smooth(images[i]) for i in range(0, len(images), max(len(images) // 16, 1))]
+    low, high = np.percentile(sample, (0.5, 99.5))
+    stretched = lambda grey: np.clip((grey - low) / max(high - low, 1e-6), 0, 1)
+    return np.stack([np.round(255 * stretched(smooth(image))).astype(np.uint8) for image in images])
 
 
 def partners(cameras: Camera, points: Float[np.ndarray, "P 3"], size: tuple[int, int], frame: int) -> list[int]:

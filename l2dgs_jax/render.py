@@ -16,8 +16,8 @@ from l2dgs_jax.data.dataset import Split
 from l2dgs_jax.data.images import to_bytes, write_image
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.files import replacing
-from l2dgs_jax.rendering import in_order
 from l2dgs_jax.runs import Run
+from l2dgs_jax.threads import in_order
 from l2dgs_jax.types import RenderOutput
 from l2dgs_jax.visualize import expected_depth, view
 

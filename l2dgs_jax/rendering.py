@@ -1,8 +1,6 @@
 """Scene, camera, instant -> images: the one function that training and every tool call."""
 
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple, TypeVar
 
@@ -18,8 +16,6 @@ from l2dgs_jax.rasterizer import rasterize
 from l2dgs_jax.scene import rung
 from l2dgs_jax.types import Camera, RenderOutput, Scene
 
-T = TypeVar("T")
-U = TypeVar("U")
 Drawn = TypeVar("Drawn", "RenderOutput", "_WellLit")
 
 
@@ -113,18 +109,6 @@ class Renderer:
             if not output.overflow:
                 return output
             self.pair_capacity = rung(1.2 * float(output.pairs))
-
-
-def in_order(function: Callable[[T], U], items: Iterable[T], workers: int = 2) -> Iterator[U]:
-    """`map`, a few items at once in threads: what one frame leaves idle of a processor, the next one uses."""
-    with ThreadPoolExecutor(workers) as pool:
-        waiting: deque[Future[U]] = deque()
-        for item in items:
-            waiting.append(pool.submit(function, item))
-            if len(waiting) > workers:
-                yield waiting.popleft().result()
-        while waiting:
-            yield waiting.popleft().result()
 
 
 class _WellLit(NamedTuple):

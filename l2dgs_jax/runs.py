@@ -91,6 +91,6 @@ def open_run(folder: Path, stage: str = "final") -> Run:
     path = folder / {"final": CHECKPOINT, "coarse": COARSE}[stage]
     if not path.exists():
         raise UserError(f"{path}: no such checkpoint; expected a run that has got that far")
-    dataset = load(scene, config.downscale, config.format, config.held_out)
+    dataset = load(scene, config.downscale, config.format, config.held_out, config.frame_memory)
     state = checkpoint.load(path, config, engine.initial_state(dataset, config)).state
     return Run(folder, config, dataset, state)

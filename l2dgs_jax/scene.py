@@ -1,5 +1,6 @@
 """A scene's initial state, its capacity, and the names of its parameter groups."""
 
+import math
 from functools import partial
 from typing import Any
 
@@ -11,10 +12,13 @@ from scipy.spatial import cKDTree
 
 from l2dgs_jax import hexplane, networks
 from l2dgs_jax.config import ModelConfig
+from l2dgs_jax.data.stacks import pixel_mean, stacked
+from l2dgs_jax.threads import in_order
 from l2dgs_jax.types import Camera, Gaussians, Scene, SceneParams
 
 SH_DC = 0.28209479177387814  # value of the first SH basis function
 LUMINANCE = np.array([0.2989, 0.587, 0.114])
+SEEN_AT_ONCE = 2**26  # colour values of points that `observed_colors` holds in memory
 
 GAUSSIAN_GROUPS: dict[str, Any] = {
     "means": "means",
@@ -138,6 +142,8 @@ def observed_colors(
 ) -> Float[np.ndarray, "P 3"]:
     """Median colour of the pixels that each point projects to, occlusion ignored; the mean where none are.
 
+    Memory is bounded whatever the numbers of frames and points: colours that take much lie in a temporary file.
+
     Args:
         points: world units.
         cameras: F cameras.
@@ -145,19 +151,33 @@ def observed_colors(
         valid: which pixels count; None for all.
     """
     height, width = images.shape[1:3]
-    seen = np.full((len(images), len(points), 3), np.nan, np.float32)
-    for frame, (viewmat, K, image) in enumerate(zip(cameras.viewmat, cameras.K, images, strict=True)):
-        x, y, z = K @ (np.asarray(viewmat)[:3, :3] @ points.T + np.asarray(viewmat)[:3, 3:])
+
+    def seen_in(frame: int) -> Float[np.ndarray, "P 3"]:
+        """Colours of the points, NaN where they are not to be seen."""
+        viewmat, K, image = np.asarray(cameras.viewmat[frame]), cameras.K[frame], images[frame]
+        x, y, z = K @ (viewmat[:3, :3] @ points.T + viewmat[:3, 3:])
         depth = np.where(z > 0, z, np.inf)
         column, row = np.floor(x / depth).astype(int), np.floor(y / depth).astype(int)
         inside = (z > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
         if valid is not None:
-            inside[inside] = valid[frame, row[inside], column[inside]]
-        seen[frame, inside] = image[row[inside], column[inside]]
-    unseen = np.isnan(seen).all((0, 2))
-    counted = True if valid is None else valid[..., None]
-    seen[:, unseen] = images.mean((0, 1, 2), dtype=np.float64, where=counted)
-    return np.nanmedian(seen, axis=0)
+            inside[inside] = valid[frame][row[inside], column[inside]]
+        colors = np.full((len(points), 3), np.nan, images.dtype)
+        colors[inside] = image[row[inside], column[inside]]
+        return colors
+
+    shape = (len(images), len(points), 3)
+    seen = stacked(in_order(seen_in, range(len(images))), shape, images.dtype, in_file=math.prod(shape) > SEEN_AT_ONCE)
+    some = max(SEEN_AT_ONCE // (3 * len(images)), 1)
+    parts = [_median(seen[:, start : start + some].astype(np.float32)) for start in range(0, len(points), some)]
+    colors = np.concatenate(parts)
+    return np.where(np.isnan(colors).all(-1, keepdims=True), pixel_mean(images, valid).astype(colors.dtype), colors)
+
+
+def _median(seen: Float[np.ndarray, "F P 3"]) -> Float[np.ndarray, "P 3"]:
+    """Median over the frames, without those that are NaN."""
+    last = np.count_nonzero(~np.isnan(seen), axis=0, keepdims=True) - 1
+    seen = np.sort(seen, axis=0)  # NaN last
+    return np.take_along_axis(seen, np.concatenate([last // 2, (last + 1) // 2]), axis=0).mean(0)
 
 
 def groups(params: SceneParams) -> SceneParams:

@@ -56,7 +56,7 @@ def _train(options: Train) -> None:
     folder, config = options.output, options.config
     assert folder is not None
     mesh = _mesh(options)
-    dataset = load(options.scene, config.downscale, config.format, config.held_out)
+    dataset = load(options.scene, config.downscale, config.format, config.held_out, config.frame_memory)
     config = engine.resolve(config, dataset.train)
     state, pair_capacity = engine.initial_state(dataset, config), None
     if options.resume:

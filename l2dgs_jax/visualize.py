@@ -15,8 +15,8 @@ from tqdm import tqdm
 from l2dgs_jax.data.images import to_bytes
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.files import replacing
-from l2dgs_jax.rendering import in_order
 from l2dgs_jax.runs import Run
+from l2dgs_jax.threads import in_order
 from l2dgs_jax.types import Camera, RenderOutput
 
 COLUMNS = ("input", "re-lit low light", "well-lit", "truth", "L", "R", "B1", "B2", "depth")

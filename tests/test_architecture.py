@@ -10,6 +10,7 @@ import l2dgs_jax
 ORDER = [
     "errors",
     "files",
+    "threads",
     "types",
     "native",
     "config",

@@ -10,7 +10,7 @@ import pytest
 
 from l2dgs_jax import checkpoint, devices, engine, step
 from l2dgs_jax.checkpoint import Checkpoint
-from l2dgs_jax.config import PRESETS, DensityConfig, from_dict, to_dict
+from l2dgs_jax.config import EXECUTION, PRESETS, DensityConfig, from_dict, to_dict
 from l2dgs_jax.data.dataset import Dataset, Split
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.rendering import Renderer
@@ -308,6 +308,48 @@ def test_a_bad_checkpoint_is_one_clear_sentence(dataset, tmp_path, damage):
     assert "\n" not in str(caught.value)
     if damage == "settings":
         assert "batch_size was 2, is 1" in str(caught.value)
+
+
+def test_a_checkpoint_is_an_npz_and_one_that_numpy_wrote_is_read(dataset, tmp_path):
+    config, path = tiny(), tmp_path / "checkpoint.npz"
+    state = engine.initial_state(dataset, config)
+    checkpoint.save(path, Checkpoint(state, 64), config)
+    with np.load(path, allow_pickle=False) as file:
+        arrays = dict(file)
+    leaves, _ = jax.tree_util.tree_flatten_with_path(state)
+    assert list(arrays) == ["header", *(jax.tree_util.keystr(key) for key, _ in leaves)]
+    np.savez(tmp_path / "numpy.npz", **arrays)
+    for name in ("checkpoint.npz", "numpy.npz"):
+        loaded, pair_capacity = checkpoint.load(tmp_path / name, config, state)
+        assert pair_capacity == 64
+        assert_equal_states(loaded, state)
+
+
+@pytest.mark.parametrize("change", [None, lambda x: x[..., None], lambda x: x[:, :-1], lambda x: x > 0])
+def test_no_array_is_read_before_all_are_known_to_fit(dataset, tmp_path, monkeypatch, change):
+    config, path = tiny(), tmp_path / "checkpoint.npz"
+    state = engine.initial_state(dataset, config)
+    checkpoint.save(path, Checkpoint(state, 64), config)
+    with np.load(path) as file:
+        arrays = dict(file)
+    last = ".adam.nu.gaussians.means"
+    changed = {} if change is None else {last: change(arrays[last])}
+    np.savez(path, **{name: x for name, x in arrays.items() if name != last}, **changed)
+
+    read, read_array = [], checkpoint.npy.read_array
+    monkeypatch.setattr(checkpoint.npy, "read_array", lambda file, **k: read.append(file.name) or read_array(file, **k))
+    with pytest.raises(UserError, match=rf"the array {last} is missing or has another shape; expected"):
+        checkpoint.load(path, config, state)
+    assert read == ["header.npy"]
+
+
+def test_how_a_run_is_carried_out_may_change_when_it_goes_on(dataset, tmp_path):
+    config, path = tiny(), tmp_path / "checkpoint.npz"
+    state = engine.initial_state(dataset, config)
+    checkpoint.save(path, Checkpoint(state, 64), config)
+    assert set(to_dict(config)) > EXECUTION
+    other = dataclasses.replace(config, checkpoint_every=7, frame_memory=0.0)
+    assert_equal_states(checkpoint.load(path, other, state).state, state)
 
 
 @pytest.mark.parametrize("preset", PRESETS)

@@ -12,6 +12,7 @@ import pytest
 from skimage.metrics import structural_similarity
 
 from l2dgs_jax import cli, runs
+from l2dgs_jax.data import load
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.evaluate import evaluate, main, table
 from l2dgs_jax.visualize import view
@@ -84,6 +85,11 @@ def test_counts(result, run):
     assert (result["split"], result["stage"], result["step"]) == ("test", "fine", 6)
     assert result["gaussians"] == int(np.sum(run.state.scene.alive))
     assert json.loads(json.dumps(result)) == result
+
+
+def test_frames_in_a_file_score_the_same(run, result):
+    scene, _ = runs.read_settings(run.folder)
+    assert evaluate(dataclasses.replace(run, dataset=load(scene, frame_memory=0.0))) == result
 
 
 def test_lowlight_scores_are_scikit_images(result, rendered):

@@ -80,6 +80,13 @@ def test_masks_of_both_splits_are_written_and_read_back(scene, tmp_path, capsys)
     assert redder[2] > redder[0] + 0.02
 
 
+def test_frames_in_a_file_give_the_same_masks(scene):
+    memory, file = data.load(scene), data.load(scene, frame_memory=0.0)
+    found = masks.compute(memory)
+    np.testing.assert_array_equal(masks.compute(file), found)
+    np.testing.assert_array_equal(masks.preview(file, found), masks.preview(memory, found))
+
+
 @pytest.mark.parametrize("lens", [Lens(), Lens((-0.3, 0.1), tangential=(0.01, -0.02)), Lens((0.05,), fisheye=True)])
 def test_masks_are_bent_as_the_lens_bends_the_pictures(lens):
     width, height, downscale = 161, 122, 2

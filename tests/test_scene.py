@@ -96,6 +96,31 @@ def test_observed_colors_take_the_median_over_frames():
     np.testing.assert_allclose(colors, 0.2, rtol=1e-6)
 
 
+@pytest.mark.parametrize("at_once", [scene.SEEN_AT_ONCE, 40])
+def test_observed_colors_are_the_same_when_few_are_held_at_once(monkeypatch, at_once):
+    rng = np.random.default_rng(4)
+    images, valid = rng.uniform(size=(7, 12, 16, 3)).astype(np.float16), rng.random((7, 12, 16)) < 0.6
+    spread = cameras(rng.uniform([-2, -1, -2], [2, 1, 3], (7, 3)))
+    monkeypatch.setattr(scene, "SEEN_AT_ONCE", at_once)
+    colors = scene.observed_colors(POINTS, spread, images, valid)
+
+    local = np.einsum("fij,pj->fpi", spread.viewmat[:, :3, :3], POINTS) + spread.viewmat[:, None, :3, 3]
+    pixels = np.floor(np.einsum("fij,fpj->fpi", spread.K, local) / np.where(local[..., 2:] > 0, local[..., 2:], np.inf))
+    mean = images.mean((0, 1, 2), np.float64, where=valid[..., None]).astype(np.float32)
+    some_seen = 0
+    for point, color in enumerate(colors):
+        seen = [
+            images[frame, int(row), int(column)].astype(np.float32)
+            for frame, (column, row, _) in enumerate(pixels[:, point])
+            if local[frame, point, 2] > 0
+            and (0 <= column < 16 and 0 <= row < 12)
+            and valid[frame, int(row), int(column)]
+        ]
+        some_seen += len(seen) > 1
+        np.testing.assert_array_equal(color, np.median(seen, axis=0) if seen else mean)
+    assert 5 < some_seen < len(POINTS)
+
+
 def test_every_parameter_has_a_group():
     params = initialise().params
     labels = jax.tree.leaves(scene.groups(params))

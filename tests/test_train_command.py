@@ -205,7 +205,7 @@ def test_a_layout_that_the_scene_does_not_have(refuses, scene, tmp_path):
 
 
 def test_layout_and_held_out_views_stay_those_of_the_run(scene, tmp_path, monkeypatch):
-    config = dataclasses.replace(PRESETS["demo"], format="nerfies", held_out="5", downscale=2)
+    config = dataclasses.replace(PRESETS["demo"], format="nerfies", held_out="5", downscale=2, frame_memory=0.5)
     runs.write_settings(tmp_path, str(scene), config)
     assert train._parse([str(scene), "--output", str(tmp_path), "--resume"]).config == config
 
@@ -216,4 +216,4 @@ def test_layout_and_held_out_views_stay_those_of_the_run(scene, tmp_path, monkey
     (tmp_path / runs.CHECKPOINT).write_bytes(b"")
     with pytest.raises(UserError) as caught:
         runs.open_run(tmp_path)
-    assert str(caught.value) == repr((str(scene), 2, "nerfies", "5"))
+    assert str(caught.value) == repr((str(scene), 2, "nerfies", "5", 0.5))

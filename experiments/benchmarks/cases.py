@@ -14,16 +14,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.benchmarks.native import NativeBlend
-from experiments.benchmarks.scenes import cloud, training
+from experiments.benchmarks.scenes import cloud, fine_state, training, video
 from experiments.benchmarks.stopwatch import best_of, peak_memory, resident_memory
-from l2dgs_jax import hexplane, losses, networks
+from l2dgs_jax import engine, hexplane, losses, networks
 from l2dgs_jax.config import PRESETS
 from l2dgs_jax.decomposition import decompose
 from l2dgs_jax.deformation import deform
 from l2dgs_jax.rasterizer import count_pairs, rasterize
-from l2dgs_jax.rendering import Renderer, in_order
+from l2dgs_jax.rendering import Renderer
 from l2dgs_jax.scene import rung
 from l2dgs_jax.step import adam, train_step
+from l2dgs_jax.threads import in_order
 from l2dgs_jax.types import Camera, MovedGaussians, RenderOutput, Scene
 
 Figures = dict[str, float]
@@ -35,6 +36,13 @@ CONFIG = dataclasses.replace(
 )
 SIZES = {"10k_160x96": (10_000, 160, 96), "50k_480x270": (50_000, 480, 270), "50k_800x450": (50_000, 800, 450)}
 STEPS = {"10k_200x112": (10_000, 200, 112), "40k_400x225": (40_000, 400, 225), "50k_800x450": (50_000, 800, 450)}
+SCALES = (  # Gaussians, frames, width, height
+    (40_000, 60, 400, 225),
+    (200_000, 60, 400, 225),
+    (200_000, 1_000, 400, 225),
+    (200_000, 1_000, 800, 450),
+    (500_000, 300, 400, 225),
+)
 
 _step = jax.jit(train_step, static_argnames=("config", "moving", "pair_capacity"), donate_argnums=0)
 
@@ -171,8 +179,19 @@ def memory() -> Figures:
     return {"50k_800x450_peak_gib": peak, "thousand_steps_growth_gib": growth}
 
 
+def scale() -> Figures:
+    """Fine steps and the peak of their process, start included, with the frames in memory and in a file."""
+    figures = {}
+    for count, frames, width, height in SCALES:
+        name = f"{count // 1000}k_{frames}_frames_{width}x{height}"
+        for place in ("memory", "file"):
+            milliseconds, peak = _child("training", *map(str, (count, frames, width, height)), place).split()
+            figures |= {f"{name}_{place}_ms": float(milliseconds), f"{name}_{place}_peak_gib": float(peak)}
+    return figures
+
+
 CASES: dict[str, Callable[[], Figures]] = {
-    case.__name__: case for case in (rasterizer, growth, folding, parts, step, rendering, compiling, memory)
+    case.__name__: case for case in (rasterizer, growth, folding, parts, step, rendering, compiling, memory, scale)
 }
 
 
@@ -230,7 +249,7 @@ def _child(name: str, *arguments: str) -> str:
         f"keep_freed_memory(); cases._{name}(*sys.argv[1:])"
     )
     done = subprocess.run([sys.executable, "-c", program, *arguments], check=True, capture_output=True, text=True)
-    return done.stdout.split()[-1]
+    return done.stdout.splitlines()[-1]
 
 
 def _first_step(folder: str, stage: str) -> None:
@@ -258,3 +277,11 @@ def _thousand_steps() -> None:
     for _ in range(1000):
         take()
     print(resident_memory() - before)
+
+
+def _training(count: str, frames: str, width: str, height: str, place: str) -> None:
+    dataset = video(int(count), int(width), int(height), int(frames), in_file=place == "file")
+    config = dataclasses.replace(CONFIG, coarse_steps=0, fine_steps=6)
+    member = engine.Member(dataset.train, config, fine_state(dataset, config))
+    times = [time.perf_counter() for _ in engine.run([member])]
+    print(1e3 * min(np.diff(times)), peak_memory())

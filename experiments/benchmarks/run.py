@@ -20,7 +20,7 @@ class Options:
     """Measure speed and memory; run it on idle cores."""
 
     cases: Annotated[tuple[str, ...], tyro.conf.Positional] = tuple(CASES)
-    """Which to run: rasterizer, growth, folding, parts, step, rendering, compiling, memory."""
+    """Which to run: rasterizer, growth, folding, parts, step, rendering, compiling, memory, scale."""
     json: Path | None = None
     """Where to write the figures."""
     update: bool = False

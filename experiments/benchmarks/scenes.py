@@ -9,6 +9,7 @@ from jax.scipy.special import logit
 from l2dgs_jax import engine
 from l2dgs_jax.config import Config
 from l2dgs_jax.data.dataset import Dataset, Split
+from l2dgs_jax.data.stacks import stacked
 from l2dgs_jax.scene import pad_rows
 from l2dgs_jax.step import Batch, TrainState, begin_stage
 from l2dgs_jax.types import Camera
@@ -43,8 +44,8 @@ def cloud(count: int, width: int, height: int, *, channels: int = 6, seed: int =
     return {name: np.asarray(array, np.float32) for name, array in arrays.items()}
 
 
-def training(count: int, width: int, height: int, config: Config, *, frames: int = 60) -> tuple[TrainState, Batch]:
-    """A fine-stage state whose Gaussians are a `cloud`, and a batch of noise to fit it to."""
+def video(count: int, width: int, height: int, frames: int, *, in_file: bool = False) -> Dataset:
+    """Frames of noise, each another, around a `cloud`."""
     arrays = cloud(count, width, height)
     rng = np.random.default_rng(1)
     viewmats = np.tile(arrays["viewmat"], (frames, 1, 1))
@@ -55,8 +56,17 @@ def training(count: int, width: int, height: int, config: Config, *, frames: int
         np.linspace(0, 1, frames, dtype=np.float32),
     )
     noise = rng.uniform(0, 0.2, (height, width, 3)).astype(np.float16)
-    split = Split(tuple(map(str, range(frames))), cameras, np.broadcast_to(noise, (frames, *noise.shape)))
-    scene = engine.initial_state(Dataset("cloud", width, height, split, split, arrays["means"]), config).scene
+    rolled = (np.roll(noise, frame, axis=1) for frame in range(frames))
+    split = Split(
+        tuple(map(str, range(frames))), cameras, stacked(rolled, (frames, *noise.shape), noise.dtype, in_file)
+    )
+    return Dataset("cloud", width, height, split, split, arrays["means"])
+
+
+def fine_state(dataset: Dataset, config: Config) -> TrainState:
+    """The start of the fine stage, with the `cloud` of a `video` as Gaussians."""
+    arrays = cloud(len(dataset.points), dataset.width, dataset.height)
+    scene = engine.initial_state(dataset, config).scene
     rows = partial(pad_rows, capacity=len(scene.alive))
     gaussians = scene.params.gaussians._replace(
         quats=rows(jnp.asarray(arrays["quats"])),
@@ -64,5 +74,11 @@ def training(count: int, width: int, height: int, config: Config, *, frames: int
         logit_opacities=rows(logit(arrays["opacities"])),
     )
     scene = scene._replace(params=scene.params._replace(gaussians=gaussians))
-    state = begin_stage(scene, jnp.asarray(config.coarse_steps, jnp.int32), config, config.fine_steps)
-    return state, engine.load_batch(split, np.linspace(0, frames - 1, config.batch_size).astype(int))
+    return begin_stage(scene, jnp.asarray(config.coarse_steps, jnp.int32), config, config.fine_steps)
+
+
+def training(count: int, width: int, height: int, config: Config) -> tuple[TrainState, Batch]:
+    """A fine-stage state and a batch of noise to fit it to."""
+    dataset = video(count, width, height, frames=60)
+    indices = np.linspace(0, len(dataset.train.names) - 1, config.batch_size).astype(int)
+    return fine_state(dataset, config), engine.load_batch(dataset.train, indices)

@@ -6,15 +6,22 @@ from types import ModuleType
 
 import numpy as np
 
+from l2dgs_jax.config import Config
 from l2dgs_jax.data import colmap, demo, llff, nerfies, splits, transforms
 from l2dgs_jax.data.dataset import Dataset
 from l2dgs_jax.errors import UserError
 
-# Each has recognizes(folder), read(folder, downscale, held_out) and write(dataset, folder).
+# Each has recognizes(folder), read(folder, downscale, held_out, frame_memory) and write(dataset, folder).
 LAYOUTS: dict[str, ModuleType] = {"nerfies": nerfies, "colmap": colmap, "transforms": transforms, "llff": llff}
 
 
-def load(scene: str | Path, downscale: int = 1, format: str = "auto", held_out: str = "auto") -> Dataset:
+def load(
+    scene: str | Path,
+    downscale: int = 1,
+    format: str = "auto",
+    held_out: str = "auto",
+    frame_memory: float = Config.frame_memory,
+) -> Dataset:
     """Read a scene, whichever of the known layouts it has.
 
     Args:
@@ -22,12 +29,15 @@ def load(scene: str | Path, downscale: int = 1, format: str = "auto", held_out: 
         downscale: whole factor by which images are smaller than full size.
         format: a name in `LAYOUTS`, or "auto" for the one that the folder has.
         held_out: which frames are not trained on, see `splits.choose`.
+        frame_memory: GiB that its frames may take; if they take more they lie in temporary files (`FileStack`).
 
     Raises:
         UserError: anything in the scene is missing, malformed or inconsistent.
     """
     if downscale < 1:
         raise UserError(f"--downscale {downscale}: expected a whole number from 1")
+    if not frame_memory >= 0:
+        raise UserError(f"--frame-memory {frame_memory}: expected GiB, from 0")
     splits.check_rule(held_out)
     folder = demo.FOLDER if scene == "demo" else Path(scene)
     if format not in ("auto", *LAYOUTS):
@@ -40,7 +50,7 @@ def load(scene: str | Path, downscale: int = 1, format: str = "auto", held_out: 
         if format == "auto":
             format = _recognized(folder)
         with np.errstate(all="ignore"):  # `assemble` complains of what has overflown
-            return LAYOUTS[format].read(folder, downscale, held_out)
+            return LAYOUTS[format].read(folder, downscale, held_out, frame_memory)
     except OSError as error:
         raise UserError(f"{error.filename or folder}: {error.strerror}; expected files that can be read") from None
 

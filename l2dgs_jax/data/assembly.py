@@ -1,26 +1,28 @@
 """From frames as a reader describes them to the data set in memory."""
 
 import os
-from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Bool, Float, Float16, Float32
+from jaxtyping import Bool, Float, Float16, Float32, UInt8
 
 from l2dgs_jax.data import images
 from l2dgs_jax.data.dataset import Dataset, Original, Split
 from l2dgs_jax.data.lens import Lens, scale_intrinsics, seen, undistort, without_skew
 from l2dgs_jax.data.pictures import Picture, stored_if_any
+from l2dgs_jax.data.stacks import stacked
 from l2dgs_jax.errors import UserError
+from l2dgs_jax.threads import in_order
 from l2dgs_jax.types import Camera
 
 LINEAR_NOTE = "pictures of floating-point values are taken as linear light and converted to sRGB"
 
-_T = TypeVar("_T")
-_U = TypeVar("_U")
+# Decoding and resampling release the interpreter lock.
+_parallel = partial(in_order, workers=min(os.cpu_count() or 1, 8))
 
 
 @dataclass(frozen=True)
@@ -58,6 +60,7 @@ def assemble(
     points: Float[np.ndarray, "P 3"],
     colors: Float[np.ndarray, "P 3"] | None,
     downscale: int,
+    frame_memory: float,
     notes: tuple[str, ...] = (),
 ) -> Dataset:
     """Read the pictures of the frames, undistorted and `downscale` times smaller than the cameras' full size.
@@ -72,11 +75,12 @@ def assemble(
         points: surface points, world units.
         colors: of the points, in [0, 1].
         downscale: every picture's own scale divides it.
+        frame_memory: GiB that pictures and truth may take together; if they take more they lie in temporary files.
         notes: what the reader assumed.
 
     Raises:
         UserError: a picture is missing, damaged, or of another size than its camera or the other pictures; or a camera
-            or point lies beyond what single precision can hold.
+            or point lies beyond what single precision can hold; or there is no room for the temporary files.
     """
     frames = [*train, *test]
     full = _common_size(frames)
@@ -85,8 +89,10 @@ def assemble(
     if _check_pictures([frame.image for frame in frames], full):
         notes = (*notes, LINEAR_NOTE)
     width, height = full[0] // downscale, full[1] // downscale
-    learned, train_notes = _read_split(folder, "train", train, width, height, downscale)
-    held_out, test_notes = _read_split(folder, "val", test, width, height, downscale)
+    kinds = 1 + (folder / "well").is_dir()  # masks take a sixth of what pictures take
+    in_file = kinds * len(frames) * height * width * 3 * np.dtype(np.float16).itemsize > frame_memory * 2**30
+    learned, train_notes = _read_split(folder, "train", train, width, height, downscale, in_file)
+    held_out, test_notes = _read_split(folder, "val", test, width, height, downscale, in_file)
     return Dataset(
         name=folder.resolve().name,
         width=width,
@@ -111,7 +117,7 @@ def _common_size(frames: Sequence[Frame]) -> tuple[int, int]:
 
 def _check_pictures(pictures: Sequence[Picture], full: tuple[int, int]) -> bool:
     """Compare every picture's header with the cameras' full size; whether any picture holds linear light."""
-    headers = _parallel(lambda picture: images.read_header(picture.path), pictures)
+    headers = list(_parallel(lambda picture: images.read_header(picture.path), pictures))
     for picture, header in zip(pictures, headers, strict=True):
         exact = (full[0] / picture.scale, full[1] / picture.scale)
         if any(abs(actual - wanted) >= 1 for actual, wanted in zip(header.size, exact, strict=True)):
@@ -124,7 +130,7 @@ def _check_pictures(pictures: Sequence[Picture], full: tuple[int, int]) -> bool:
 
 
 def _read_split(
-    folder: Path, part: str, frames: Sequence[Frame], width: int, height: int, downscale: int
+    folder: Path, part: str, frames: Sequence[Frame], width: int, height: int, downscale: int, in_file: bool
 ) -> tuple[Split, list[str]]:
     """Read the pictures of one split, with notes; truth and masks that no frame has are None."""
     names = [frame.name for frame in frames]
@@ -136,22 +142,27 @@ def _read_split(
     def shrink(image: Float32[np.ndarray, "h w C"], scale: int) -> Float32[np.ndarray, "H W C"]:
         return images.area_average(image, downscale // scale)[:height, :width]
 
-    def read_all(root: Path, prefix: str = "", all_or_none: bool = False) -> Float16[np.ndarray, "F H W 3"] | None:
-        found, note = stored_if_any(root, downscale, [prefix + name for name in names], all_or_none)
+    def stack(values: Iterator[np.ndarray], dtype: type, *channels: int) -> np.ndarray:
+        return stacked(values, (len(frames), height, width, *channels), dtype, in_file)
+
+    def read_all(root: Path, prefix: str = "", masks: bool = True) -> np.ndarray | None:
+        found, note = stored_if_any(root, downscale, [prefix + name for name in names], all_or_none=not masks)
         if note:
             notes.append(note)
         if not found:
             return None
         _check_pictures(found, frames[0].size)
-        read = lambda i: fit(frames[i], found[i].scale, images.read_image(found[i].path))
-        return _filled(read, (len(frames), height, width, 3))
 
-    def majority(values: Float16[np.ndarray, "F H W 3"] | None) -> Bool[np.ndarray, "F H W"] | None:
-        return None if values is None else values.mean(-1) > 0.5
+        def read(index: int) -> Float16[np.ndarray, "H W 3"] | Bool[np.ndarray, "H W"]:
+            picture = found[index]
+            image = fit(frames[index], picture.scale, images.read_image(picture.path)).astype(np.float16)
+            return image.mean(-1) > 0.5 if masks else image
 
-    marked: dict[int, Bool[np.ndarray, "H W"]] = {}  # of the frames whose pixels do not all count
+        return stack(_parallel(read, range(len(frames))), *((bool,) if masks else (np.float16, 3)))
 
-    def read_frame(index: int) -> Float32[np.ndarray, "H W 3"]:
+    marked: dict[int, UInt8[np.ndarray, " B"]] = {}  # of the frames whose pixels do not all count, which do, as bits
+
+    def read_frame(index: int) -> Float16[np.ndarray, "H W 3"]:
         frame = frames[index]
         scale, alpha = frame.image.scale, None
         if frame.alpha == "coverage":
@@ -166,49 +177,35 @@ def _read_split(
         if alpha is not None:
             counts = counts & (fit(frame, scale, (alpha > 0.5).astype(np.float32))[..., 0] > 0.999)
         if not counts.all():
-            marked[index] = counts
-        return fit(frame, scale, image)
+            marked[index] = np.packbits(counts)
+        return fit(frame, scale, image).astype(np.float16)
+
+    def counting(index: int) -> Bool[np.ndarray, "H W"]:
+        bits = marked.get(index, every_bit)
+        return np.unpackbits(bits, count=height * width).reshape(height, width).astype(bool)
 
     all_count = np.ones((height, width), bool)
-    lowlight = _filled(read_frame, (len(frames), height, width, 3))
+    every_bit = np.packbits(all_count)
+    lowlight = stack(_parallel(read_frame, range(len(frames))), np.float16, 3)
     K = [scale_intrinsics(without_skew(frame.K), downscale) for frame in frames]
     split = Split(
         names=tuple(names),
         cameras=Camera(
-            viewmat=_stacked([frame.viewmat for frame in frames], frames),
-            K=_stacked(K, frames),
-            time=_stacked([np.array(frame.time) for frame in frames], frames),
+            viewmat=_singles([frame.viewmat for frame in frames], frames),
+            K=_singles(K, frames),
+            time=_singles([np.array(frame.time) for frame in frames], frames),
         ),
         images=lowlight,
-        welllit=read_all(folder / "well", all_or_none=True),
-        masks=majority(read_all(folder / "mask")),
-        valid=np.stack([marked.get(i, all_count) for i in range(len(frames))]) if marked else None,
-        covisible=majority(read_all(folder / "covisible", f"{part}/")),
+        welllit=read_all(folder / "well", masks=False),
+        masks=read_all(folder / "mask"),
+        valid=stack(map(counting, range(len(frames))), bool) if marked else None,
+        covisible=read_all(folder / "covisible", f"{part}/"),
         originals=tuple(Original(frame.size, frame.K, frame.lens) for frame in frames),
     )
     return split, notes
 
 
-def _filled(
-    read: Callable[[int], Float32[np.ndarray, "H W 3"]], shape: tuple[int, int, int, int]
-) -> Float16[np.ndarray, "F H W 3"]:
-    """Stack what `read` returns for each frame, without ever holding it twice."""
-    stacked = np.empty(shape, np.float16)
-
-    def fill(index: int) -> None:
-        stacked[index] = read(index)
-
-    _parallel(fill, range(shape[0]))
-    return stacked
-
-
-def _parallel(function: Callable[[_T], _U], items: Iterable[_T]) -> list[_U]:
-    """Map on threads: decoding and resampling release the interpreter lock."""
-    with ThreadPoolExecutor(max_workers=min(os.cpu_count() or 1, 8)) as pool:
-        return list(pool.map(function, items))
-
-
-def _stacked(values: Sequence[np.ndarray], frames: Sequence[Frame]) -> Any:
+def _singles(values: Sequence[np.ndarray], frames: Sequence[Frame]) -> Any:
     """Stacked as float32; `Any` because `Camera` declares jax arrays and these are NumPy's."""
     return np.stack([_single(x, f"{frame.source}: the camera") for x, frame in zip(values, frames, strict=True)])
 

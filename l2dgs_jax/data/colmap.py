@@ -28,13 +28,14 @@ def recognizes(folder: Path) -> bool:
     return colmap_model.find(folder) is not None
 
 
-def read(folder: Path, downscale: int, held_out: str) -> Dataset:
+def read(folder: Path, downscale: int, held_out: str, frame_memory: float) -> Dataset:
     """Read a scene; its world is the model's.
 
     Args:
         folder: of the scene.
         downscale: factor on the full size of the images.
         held_out: see `splits.choose`; without lists every eighth frame is held out.
+        frame_memory: see `assemble`.
 
     Raises:
         UserError: a file is missing, malformed or inconsistent.
@@ -71,7 +72,7 @@ def read(folder: Path, downscale: int, held_out: str) -> Dataset:
     others = sorted(path.name for path in (folder / "sparse").iterdir() if path.is_dir() and path != place)
     if others:
         notes = (*notes, f"{place} is used; sparse/ also holds the models {', '.join(others)}")
-    return assemble(folder, frames(train), frames(test), points, colors, downscale, notes)
+    return assemble(folder, frames(train), frames(test), points, colors, downscale, frame_memory, notes)
 
 
 def write(dataset: Dataset, folder: Path) -> None:

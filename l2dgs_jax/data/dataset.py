@@ -26,7 +26,7 @@ class Original(NamedTuple):
 
 @dataclass(frozen=True)
 class Split:
-    """Frames of a scene, in memory as NumPy arrays.
+    """Frames of a scene as NumPy arrays; images, truth and masks beyond a budget of memory are `FileStack`s.
 
     Attributes:
         names: of the frames.

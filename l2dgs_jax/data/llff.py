@@ -32,13 +32,14 @@ def recognizes(folder: Path) -> bool:
     return (folder / FILE).is_file() and colmap_model.find(folder) is None
 
 
-def read(folder: Path, downscale: int, held_out: str) -> Dataset:
+def read(folder: Path, downscale: int, held_out: str, frame_memory: float) -> Dataset:
     """Read a scene; without a point cloud, random points fill the views between the bounds.
 
     Args:
         folder: of the scene.
         downscale: factor on the full size of the images.
         held_out: see `splits.choose`; without lists every eighth frame is held out.
+        frame_memory: see `assemble`.
 
     Raises:
         UserError: a file is missing, malformed or inconsistent.
@@ -72,7 +73,7 @@ def read(folder: Path, downscale: int, held_out: str) -> Dataset:
         cloud = clouds.in_frusta(np.stack(viewmats), np.stack(Ks), sizes[0], rows[:, 15:]), None
         stand_in = f"{clouds.COUNT} random points between the bounds stand in for one"
         notes = (*notes, f"{folder} has no point cloud: {stand_in}")
-    return assemble(folder, frames(train), frames(test), *cloud, downscale, notes)
+    return assemble(folder, frames(train), frames(test), *cloud, downscale, frame_memory, notes)
 
 
 def write(dataset: Dataset, folder: Path) -> None:

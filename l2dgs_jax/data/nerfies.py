@@ -29,13 +29,14 @@ def recognizes(folder: Path) -> bool:
     return (folder / "camera").is_dir()
 
 
-def read(folder: Path, downscale: int, held_out: str) -> Dataset:
+def read(folder: Path, downscale: int, held_out: str, frame_memory: float) -> Dataset:
     """Read a scene. World units are those of the scene file: X' = (X - center) * scale.
 
     Args:
         folder: of the scene.
         downscale: factor on the full size of the images.
         held_out: see `splits.choose`.
+        frame_memory: see `assemble`.
 
     Raises:
         UserError: a file is missing, malformed or inconsistent.
@@ -54,7 +55,7 @@ def read(folder: Path, downscale: int, held_out: str) -> Dataset:
         ]
 
     world = (points - center) * scale
-    return assemble(folder, frames(train), frames(val), world, colors, downscale, notes)
+    return assemble(folder, frames(train), frames(val), world, colors, downscale, frame_memory, notes)
 
 
 def _normalization(folder: Path) -> tuple[Float64[np.ndarray, "3"], float]:

@@ -39,13 +39,14 @@ def recognizes(folder: Path) -> bool:
     return any((folder / f"transforms{part}.json").is_file() for part in ("", "_train"))
 
 
-def read(folder: Path, downscale: int, held_out: str) -> Dataset:
+def read(folder: Path, downscale: int, held_out: str, frame_memory: float) -> Dataset:
     """Read a scene; without a point cloud, random points fill a box that all cameras look at.
 
     Args:
         folder: of the scene.
         downscale: factor on the full size of the images.
         held_out: see `splits.choose`; without lists every eighth frame is held out.
+        frame_memory: see `assemble`.
 
     Raises:
         UserError: a file is missing, malformed or inconsistent.
@@ -63,7 +64,9 @@ def read(folder: Path, downscale: int, held_out: str) -> Dataset:
         cloud = clouds.in_common_box(np.stack([frame.viewmat for frame in frames.values()]), str(folder)), None
         stand_in = f"{clouds.COUNT} random points where its cameras look stand in for one"
         notes = (*notes, f"{folder} has no point cloud: {stand_in}")
-    return assemble(folder, [frames[n] for n in train], [frames[n] for n in test], *cloud, downscale, notes)
+    return assemble(
+        folder, [frames[n] for n in train], [frames[n] for n in test], *cloud, downscale, frame_memory, notes
+    )
 
 
 def write(dataset: Dataset, folder: Path) -> None:

@@ -34,7 +34,7 @@ def enter(spec: Spec) -> list[list[Entrant]]:
     groups: dict[tuple, list[Entrant]] = {}
     for plan in spec.plans:
         c = plan.config
-        source = (plan.scene, c.downscale, c.format, c.held_out)
+        source = (plan.scene, c.downscale, c.format, c.held_out, c.frame_memory)
         if source not in datasets:
             datasets[source] = load(*source)
         dataset = datasets[source]

@@ -1,0 +1,76 @@
+"""Frames of one size stacked into one array: in memory, or in a temporary file that passes through it."""
+
+import math
+import mmap
+import os
+import tempfile
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Shaped
+from numpy.typing import DTypeLike
+
+from l2dgs_jax.errors import UserError
+
+
+class FileStack(np.ndarray):
+    """A read-only array over a mapped file: what is taken from it by index, or frame by frame, is a copy.
+
+    The pages that were read are given back at once, to the system's cache of files: of the whole stack, no more than
+    what is just being copied counts as memory of the process.
+    """
+
+    def __getitem__(self, key: Any) -> Any:
+        taken = np.array(self.view(np.ndarray)[key])[()]
+        if isinstance(self.base, mmap.mmap) and hasattr(mmap, "MADV_DONTNEED"):
+            self.base.madvise(mmap.MADV_DONTNEED)
+        return taken
+
+
+def stacked(
+    frames: Iterable[Shaped[np.ndarray, "..."]], shape: tuple[int, ...], dtype: DTypeLike, in_file: bool
+) -> Shaped[np.ndarray, "..."]:
+    """The frames as one array, without ever holding them twice.
+
+    Args:
+        frames: as many as the first number of `shape`, each of the shape that the others give.
+        shape: of the stack.
+        dtype: of the stack.
+        in_file: return a `FileStack`. Its file has no name, in the folder for temporary files that TMPDIR names, and
+            is gone with the last use of the array, however the process ends.
+
+    Raises:
+        UserError: there is no room for the file.
+    """
+    size = math.prod(shape) * np.dtype(dtype).itemsize
+    if not in_file or not size:
+        stack = np.empty(shape, dtype)
+        for place, frame in zip(range(len(stack)), frames, strict=True):
+            stack[place] = frame
+        return stack
+    try:
+        with tempfile.TemporaryFile() as file:
+            if hasattr(os, "posix_fallocate"):  # a full disk should be known before the first frame is made
+                os.posix_fallocate(file.fileno(), 0, size)
+            for _, frame in zip(range(shape[0]), frames, strict=True):
+                file.write(np.ascontiguousarray(frame, dtype).data)
+            file.flush()
+            return FileStack(shape, dtype, mmap.mmap(file.fileno(), size, access=mmap.ACCESS_READ))
+    except OSError as error:
+        raise UserError(
+            f"{tempfile.tempdir or 'TMPDIR'}: cannot hold {size / 2**30:.2g} GiB of frames ({error.strerror}); "
+            "expected TMPDIR to name a writable folder that can"
+        ) from None
+
+
+def pixel_mean(
+    stack: Shaped[np.ndarray, "F H W *C"], valid: Bool[np.ndarray, "F H W"] | None = None
+) -> Float[np.ndarray, "*C"]:
+    """The mean over all pixels, or all `valid` ones, frame by frame."""
+    total, count = np.zeros(stack.shape[3:]), 0
+    for index, frame in enumerate(stack):
+        counted = np.ones(frame.shape[:2], bool) if valid is None else valid[index]
+        total += frame.sum((0, 1), np.float64, where=counted.reshape(*counted.shape, *[1] * total.ndim))
+        count += int(counted.sum())
+    return np.asarray(total / count)
