@@ -41,6 +41,21 @@ def apart(function: Callable[..., T]) -> Callable[..., T]:
     return lambda *arguments: jax.lax.platform_dependent(*arguments, cpu=separate, default=function)
 
 
+def stage(function: Callable[..., T]) -> Callable[..., T]:
+    """The same function, kept `apart`, and so is its gradient, which is computed from the arguments; reverse mode only.
+
+    For long arithmetic with many results: divided into stages, little of it is computed more than once.
+    """
+    staged = jax.custom_vjp(lambda *arguments: apart(function)(*arguments))
+
+    def backward(arguments, cotangent):
+        pull = lambda arguments, cotangent: jax.vjp(function, *arguments)[1](cotangent)
+        return apart(pull)(arguments, cotangent)
+
+    staged.defvjp(lambda *arguments: (staged(*arguments), arguments), backward)
+    return staged
+
+
 def read(array: Shaped[Array, " N"], i: Int[Array, ""]) -> Shaped[Array, ""]:
     """`array[i]` with `i` clamped to the array."""
     return jax.lax.dynamic_index_in_dim(array, i, keepdims=False)
