@@ -18,6 +18,7 @@ ORDER = [
     "epipolar",
     "motion",
     "hexplane",
+    "convolution",
     "networks",
     "spherical_harmonics",
     "deformation",
