@@ -68,3 +68,9 @@ def test_single_precision_keeps_its_digits():
     gradient = jax.grad(lambda kernel, x: convolve(x, kernel).sum())
     exact, single = gradient(kernel, x), jax.jit(gradient)(kernel.astype(jnp.float32), x.astype(jnp.float32))
     np.testing.assert_allclose(single, exact, rtol=3e-6)
+
+
+def test_a_cotangent_known_to_be_zero_compiles():
+    x, kernel, _ = case(3, 4, 4)
+    gradient = jax.jit(jax.grad(lambda kernel, x: convolve(convolve(x, kernel), jnp.zeros_like(kernel)).sum()))
+    np.testing.assert_array_equal(gradient(kernel, x), 0)
