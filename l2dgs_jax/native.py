@@ -26,7 +26,9 @@ def one_function(function: Callable[..., T]) -> Callable[..., T]:
     if not TRIED:
         return function
 
-    return _call(function, xla_cpu_small_call="true", inlineable="false")
+    call = _call(function, xla_cpu_small_call="true", inlineable="false")
+    # Were an argument known to be zero, simplifications might leave another one unused.
+    return lambda *arguments: call(*jax.lax.optimization_barrier(arguments))
 
 
 def apart(function: Callable[..., T]) -> Callable[..., T]:
@@ -39,6 +41,21 @@ def apart(function: Callable[..., T]) -> Callable[..., T]:
         return function
     separate = _call(function, inlineable="false")
     return lambda *arguments: jax.lax.platform_dependent(*arguments, cpu=separate, default=function)
+
+
+def stage(function: Callable[..., T]) -> Callable[..., T]:
+    """The same function, kept `apart`, and so is its gradient, which is computed from the arguments; reverse mode only.
+
+    For long arithmetic with many results: divided into stages, little of it is computed more than once.
+    """
+    staged = jax.custom_vjp(lambda *arguments: apart(function)(*arguments))
+
+    def backward(arguments, cotangent):
+        pull = lambda arguments, cotangent: jax.vjp(function, *arguments)[1](cotangent)
+        return apart(pull)(arguments, cotangent)
+
+    staged.defvjp(lambda *arguments: (staged(*arguments), arguments), backward)
+    return staged
 
 
 def read(array: Shaped[Array, " N"], i: Int[Array, ""]) -> Shaped[Array, ""]:

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from l2dgs_jax.config import ModelConfig
+from l2dgs_jax.convolution import convolve
 from l2dgs_jax.types import BAFENet, Conv, GroupNorm, Linear, Motion, MotionHeads, OCDNet
 
 # B1 and B2 lie in the open interval CENTRE - REACH ... CENTRE + REACH.
@@ -162,9 +163,7 @@ def init_conv(key: PRNGKeyArray, size: int, inputs: int, outputs: int) -> Conv:
 
 def apply_conv(layer: Conv, x: Float[Array, "B H W I"]) -> Float[Array, "B H W O"]:
     """Convolution with zero padding that keeps the size. Gradients flow to both arguments."""
-    layout = ("NHWC", "HWIO", "NHWC")
-    y = jax.lax.conv_general_dilated(x, layer.weight, (1, 1), "SAME", dimension_numbers=layout)
-    return y + layer.bias[None, None, None]
+    return convolve(x, layer.weight) + layer.bias[None, None, None]
 
 
 def _group_norm(layer: GroupNorm, x: Float[Array, "B H W C"], groups: int) -> Float[Array, "B H W C"]:

@@ -5,6 +5,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from l2dgs_jax.native import stage
+
 NEAR = 0.01  # world units; Gaussians whose centre is nearer are not drawn
 BLUR = 0.3  # pixels^2 added to the projected covariance, so that no Gaussian falls between pixels
 FIELD_MARGIN = 0.3  # of half the field of view: how far outside the image the Jacobian still follows the centre
@@ -29,21 +31,8 @@ class Projected(NamedTuple):
 
 
 def rotations(quats: Float[Array, "N 4"]) -> Float[Array, "3 3 N"]:
-    """Rotation matrices of quaternions (wxyz) of any norm; a zero quaternion is the identity and has no gradient.
-
-    The Gaussians are the last axis: every entry is one vector, and arithmetic with entries is what CPUs are fast at.
-    """
-    w, x, y, z = quats.T
-    squared = w * w + x * x + y * y + z * z
-    zero = squared <= 1e-24
-    inverse_norm = jnp.where(zero, 0, 1 / jnp.sqrt(jnp.where(zero, 1, squared)))
-    w, x, y, z = (part * inverse_norm for part in (w, x, y, z))
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return jnp.stack([jnp.stack(row) for row in rows])
+    """Rotation matrices of quaternions (wxyz) of any norm; a zero quaternion is the identity and has no gradient."""
+    return jnp.stack([jnp.stack(row) for row in _rotation(*_unit(*quats.T))])
 
 
 def project(
@@ -57,7 +46,8 @@ def project(
 ) -> Projected:
     """Project Gaussians by a pinhole camera, to first order around their centres (EWA; 3DGS, arXiv 2308.04079).
 
-    Gradients flow to means, quats, scales, viewmat and K, and are zero for Gaussians nearer than the near plane.
+    Gradients flow to means, quats, scales, viewmat and K, in reverse mode only, and are zero for Gaussians nearer than
+    the near plane.
 
     Args:
         means: centres, world units.
@@ -68,35 +58,74 @@ def project(
         width: pixels.
         height: pixels.
     """
-    camera_means = means @ viewmat[:3, :3].T + viewmat[None, :3, 3]
-    # A NaN depth counts as visible, so that it shows in the image instead of vanishing.
-    visible = ~(camera_means[:, 2] <= NEAR)
-    x, y, z = jnp.where(visible[:, None], camera_means, jnp.array([0, 0, 1], means.dtype)[None]).T
-    normalised = jnp.stack([x / z, y / z], axis=-1)
-    means2d = normalised @ K[:2, :2].T + K[None, :2, 2]
-
-    focal, centre = jnp.diagonal(K)[:2], K[:2, 2]
     size = jnp.array([width, height], means.dtype)
-    margin = FIELD_MARGIN * 0.5 * size / focal
-    lowest, highest = -(centre / focal + margin), (size - centre) / focal + margin
-    tx, ty = jnp.clip(normalised, lowest[None], highest[None]).T
-    turned, deviations = rotations(quats), scales.T
+    visible, depth, normalised = _before_camera(tuple(means.T), viewmat)
+    centre, jacobian = _through_lens(depth, normalised, viewmat, K, size)
+    covariance = _covariance(*_half(jacobian, _rotation(*_unit(*quats.T)), tuple(scales.T)))
+    gather = lambda columns: jnp.stack(columns).T
+    return Projected(gather(centre), gather(covariance), gather(_conic(*covariance)), depth, visible)
 
-    def half(focal, tangent, row):
-        """A row of J W R S, whose product with its transpose is the covariance."""
-        towards = [focal / z * (viewmat[row, axis] - tangent * viewmat[2, axis]) for axis in range(3)]
-        return [deviations[j] * sum(towards[k] * turned[k, j] for k in range(3)) for j in range(3)]
 
-    u, v = half(focal[0], tx, 0), half(focal[1], ty, 1)
+# Every entry of a point or a matrix is a column, one vector over all Gaussians: arithmetic with whole columns is what
+# CPUs are fast at. Columns are kept between the stages; within one they are computed again for each that needs them.
+
+
+@stage
+def _unit(w, x, y, z):
+    squared = w * w + x * x + y * y + z * z
+    zero = squared <= 1e-24
+    inverse_norm = jnp.where(zero, 0, 1 / jnp.sqrt(jnp.where(zero, 1, squared)))
+    return tuple(part * inverse_norm for part in (w, x, y, z))
+
+
+@stage
+def _rotation(w, x, y, z):
+    return (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+
+
+@stage
+def _before_camera(mean, viewmat):
+    """Whether a centre is visible, its depth, and where its ray meets the plane at depth 1."""
+    x, y, z = (sum(viewmat[row, k] * mean[k] for k in range(3)) + viewmat[row, 3] for row in range(3))
+    # A NaN depth counts as visible, so that it shows in the image instead of vanishing.
+    visible = ~(z <= NEAR)
+    z = jnp.where(visible, z, 1)
+    return visible, z, tuple(jnp.where(visible, part, 0) / z for part in (x, y))
+
+
+@stage
+def _through_lens(depth, normalised, viewmat, K, size):
+    """The centre in pixels, and the rows of J W, clamped to the field of view."""
+
+    def row(axis):
+        focal, centre = K[axis, axis], K[axis, 2]
+        margin = FIELD_MARGIN * 0.5 * size[axis] / focal
+        tangent = jnp.clip(normalised[axis], -(centre / focal + margin), (size[axis] - centre) / focal + margin)
+        return tuple(focal / depth * (viewmat[axis, k] - tangent * viewmat[2, k]) for k in range(3))
+
+    pixel = lambda axis: K[axis, 0] * normalised[0] + K[axis, 1] * normalised[1] + K[axis, 2]
+    return (pixel(0), pixel(1)), (row(0), row(1))
+
+
+@stage
+def _half(jacobian, rotation, scale):
+    """J W R S, whose product with its transpose is the covariance."""
+    return tuple(tuple(scale[j] * sum(row[k] * rotation[k][j] for k in range(3)) for j in range(3)) for row in jacobian)
+
+
+@stage
+def _covariance(u, v):
     dot = lambda p, q: sum(a * b for a, b in zip(p, q, strict=True))
-    xx, xy, yy = dot(u, u) + BLUR, dot(u, v), dot(v, v) + BLUR
+    return dot(u, u) + BLUR, dot(u, v), dot(v, v) + BLUR
+
+
+@stage
+def _conic(xx, xy, yy):
     # Cauchy-Schwarz bounds the unblurred determinant by zero; the blur keeps this sum positive after rounding too.
     determinant = (xx - BLUR) * (yy - BLUR) - xy * xy
     determinant = jnp.maximum(determinant, 0) + BLUR * (xx + yy - BLUR)
-    return Projected(
-        means2d=means2d,
-        covariances2d=jnp.stack([xx, xy, yy]).T,
-        conics=(jnp.stack([yy, -xy, xx]) / determinant[None]).T,
-        depths=z,
-        visible=visible,
-    )
+    return yy / determinant, -xy / determinant, xx / determinant

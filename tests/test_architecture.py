@@ -19,6 +19,7 @@ ORDER = [
     "epipolar",
     "motion",
     "hexplane",
+    "convolution",
     "networks",
     "spherical_harmonics",
     "deformation",

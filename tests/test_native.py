@@ -29,3 +29,11 @@ def test_widen_repeats_and_its_gradient_sums():
     x = jnp.asarray(np.random.default_rng(1).normal(size=(2, 3)))
     np.testing.assert_array_equal(native.widen(x, 4), np.repeat(x[..., None], 4, axis=-1))
     check_grads(jax.jit(lambda x: native.widen(x, 4) ** 2), (x,), order=1)
+
+
+def test_a_stage_and_its_gradient_are_those_of_the_function():
+    function = lambda x, pair: (x * pair[0], {"sum": jnp.sin(pair[1]) + x})
+    arguments = jnp.linspace(0.5, 2, 5), (jnp.linspace(-1, 1, 5), jnp.linspace(2, 3, 5))
+    for staged in (native.stage(function), jax.vmap(native.stage(function))):
+        jax.tree.map(np.testing.assert_array_equal, jax.jit(staged)(*arguments), function(*arguments))
+        check_grads(jax.jit(staged), arguments, order=1, modes=("rev",))

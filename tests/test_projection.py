@@ -79,7 +79,7 @@ def test_rotations_are_rotations_whatever_the_norm(scene):
 
 
 def test_gradients(scene):
-    check_grads(outputs, scene, order=1, modes=("fwd", "rev"))
+    check_grads(outputs, scene, order=1, modes=("rev",))
 
 
 def test_extremes_are_finite(scene):

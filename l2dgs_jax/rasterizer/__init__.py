@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from l2dgs_jax.native import stage
 from l2dgs_jax.projection import Projected, project
 from l2dgs_jax.rasterizer.composite import composite
 from l2dgs_jax.rasterizer.intersect import TILE, Footprints, footprints, grid, intersect, pairs_needed
@@ -104,9 +105,7 @@ def _rasterize(means, quats, scales, opacities, features, viewmat, K, probe, wid
     packed = jnp.concatenate([projected.means2d, projected.conics, opacities[..., None], *channels], axis=-1)
     blended = composite(packed.reshape(-1, packed.shape[-1]), lists, width, height)
 
-    columns, rows = grid(width, height)
-    image = blended.reshape(means.shape[0], rows, columns, -1, TILE, TILE).transpose(0, 1, 4, 2, 5, 3)
-    image = image.reshape(means.shape[0], rows * TILE, columns * TILE, -1)[:, :height, :width]
+    image = stage(partial(_untiled, width=width, height=height))(blended)
     return RasterOutput(
         features=image[..., :-2],
         alpha=image[..., -1],
@@ -116,3 +115,10 @@ def _rasterize(means, quats, scales, opacities, features, viewmat, K, probe, wid
         pairs=pairs,
         overflow=pairs > capacity,
     )
+
+
+def _untiled(tiles: Float[Array, "T C P"], width: int, height: int) -> Float[Array, "V H W C"]:
+    """The images that tiles belong to."""
+    columns, rows = grid(width, height)
+    image = tiles.reshape(-1, rows, columns, tiles.shape[1], TILE, TILE).transpose(0, 1, 4, 2, 5, 3)
+    return image.reshape(-1, rows * TILE, columns * TILE, tiles.shape[1])[:, :height, :width]
