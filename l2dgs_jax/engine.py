@@ -235,13 +235,18 @@ _with_capacity = partial(jax.jit, static_argnums=1)(jax.vmap(with_capacity, (0, 
 
 
 def _each_member(function: Callable, mesh: Mesh | None, step: Int[Array, ""] | int, *trees: PyTree) -> Any:
-    """`function(step, *rows)` of every row of the trees, those that share a device in one vmap."""
+    """`function(step, *rows)` of every row of the trees."""
+    platform = (mesh.devices.flat[0] if mesh else jax.devices()[0]).platform
 
     def here(step, *trees):
-        if len(jax.tree.leaves(trees)[0]) > 1:
-            return jax.lax.map(lambda row: function(step, *row), trees)
-        alone = function(step, *jax.tree.map(lambda x: x.squeeze(0), trees))
-        return jax.tree.map(lambda x: x[None], alone)
+        """Of the rows that this device has."""
+        each = partial(function, step)
+        if len(jax.tree.leaves(trees)[0]) == 1:
+            return jax.tree.map(lambda x: x[None], each(*jax.tree.map(lambda x: x.squeeze(0), trees)))
+        if platform == "cpu":
+            # One member keeps all cores busy; side by side they take 1.4 times as long, out of the caches.
+            return jax.lax.map(lambda rows: each(*rows), trees)
+        return jax.vmap(each)(*trees)
 
     if mesh is None:
         return here(step, *trees)

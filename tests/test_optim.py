@@ -10,7 +10,7 @@ import pytest
 
 from l2dgs_jax import optim
 from l2dgs_jax.config import OptimConfig
-from l2dgs_jax.engine import OptaxSolver, OptaxState
+from l2dgs_jax.step import OptaxSolver, OptaxState
 
 
 def constant(rate):
