@@ -1,5 +1,6 @@
 """The devices that a training is spread over, in one process or several."""
 
+import itertools
 from collections.abc import Iterator
 from typing import TypeVar
 
@@ -15,17 +16,19 @@ T = TypeVar("T")
 
 
 def mesh(members: int = 1, views: int = 1) -> Mesh | None:
-    """The first `members` x `views` devices of all processes; None if that is one device of one.
+    """`members` x `views` devices, as many of each process as can be; None for the only one of a single process.
 
     Raises:
         ValueError: there are not that many, or a process would be left without.
     """
-    count, found = members * views, jax.devices()
+    count = members * views
+    by_process = [[d for d in jax.devices() if d.process_index == p] for p in range(jax.process_count())]
+    found = [device for rank in itertools.zip_longest(*by_process) for device in rank if device is not None]
     if count == 1 and jax.process_count() == 1:
         return None
     if count > len(found):
         raise ValueError(f"{count} devices are wanted, {len(found)} found")
-    used = found[:count]
+    used = sorted(found[:count], key=lambda device: (device.process_index, device.id))
     if len({device.process_index for device in used}) < jax.process_count():
         raise ValueError(f"{count} devices leave some of the {jax.process_count()} processes without any")
     return Mesh(np.array(used).reshape(members, views), (MEMBERS, VIEWS))

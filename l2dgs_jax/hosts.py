@@ -37,9 +37,11 @@ class Hosts:
 def together(hosts: Hosts) -> Iterator[None]:
     """Join the other processes, and part from them at the end; does nothing for one process.
 
+    If the others are not found or lost, or if the block raises, the process ends with exit code 2 and the reason on
+    standard error: it would wait for the others, or they for it.
+
     Raises:
         UserError: an option is missing or malformed.
-        SystemExit: the processes do not find each other, or one is lost; the reason is on standard error.
     """
     address = hosts.coordinator or os.environ.get("JAX_COORDINATOR_ADDRESS")
     if address is None:
@@ -57,8 +59,10 @@ def together(hosts: Hosts) -> Iterator[None]:
         f"--coordinator {address}: the {count} processes did not find each other within {hosts.timeout} s; expected "
         "all of them to be started with the same address, which process 0 can be reached at"
     )
-    lost = "another process of this training has gone or fallen silent; expected all of them to run to the end: "
-    lost += "start all again with --resume"
+    lost = (
+        "this training has lost one of its processes, or the way to it; expected all of them to run to the end: start "
+        "all again with --resume"
+    )
     with _last_words() as prepare:
         prepare(alone)
         # Past its own limit jaxlib ends the process with a stack trace: ours comes first.
@@ -80,10 +84,11 @@ def together(hosts: Hosts) -> Iterator[None]:
             yield
         except UserError as error:
             _leave(prepare, str(error))
-        except (jax.errors.JaxRuntimeError, ValueError) as error:  # a broken connection may come as either
-            if "Gloo" not in str(error) and not isinstance(error, jax.errors.JaxRuntimeError):
-                traceback.print_exc()
-            _leave(prepare, f"{lost} ({str(error).splitlines()[0]})")
+        except BaseException as error:
+            # A broken connection comes as a ValueError too.
+            if isinstance(error, jax.errors.JaxRuntimeError) or "Gloo" in str(error):
+                _leave(prepare, f"{lost} ({str(error).splitlines()[0]})")
+            _leave(prepare, "".join(traceback.format_exception(error)))
         jax.distributed.shutdown()
 
 
@@ -105,6 +110,7 @@ def _number(option: str, value: int | None, variable: str) -> int:
 def _leave(prepare: Callable[[str], None], sentence: str) -> None:
     """End at once: the usual end would wait for processes that may be gone."""
     prepare("")
+    sys.stdout.flush()
     print(f"error: {sentence}", file=sys.stderr, flush=True)
     os._exit(2)
 

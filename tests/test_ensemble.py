@@ -110,6 +110,7 @@ def test_members_that_were_interrupted_at_different_steps_catch_up(members, alon
         assert_same_training(together, index, expected)
 
 
+@pytest.mark.slow
 def test_the_views_of_a_batch_on_several_devices(members, alone):
     assert_same_training(last(members[:1], mesh=devices.mesh(views=2)), 0, alone[0])
 
@@ -131,6 +132,7 @@ def test_a_small_pair_buffer_grows_for_all(members, alone):
         assert_same_training(together, index, expected)
 
 
+@pytest.mark.slow
 def test_every_setting_that_members_may_differ_in_can_be_traced(members):
     """A step whose numbers are traced is the step whose numbers are compiled in."""
     one = member(0, {"loss.amplification": 0.02, "optim.decay_steps": 7})

@@ -145,7 +145,7 @@ def test_two_processes_one_of_which_is_killed(start, whole, tmp_path, survivor):
     (left,) = killed_after_a_checkpoint(folder, processes[survivor], processes[1 - survivor])
     _, errors = left.communicate(timeout=120)
     assert left.returncode != 0
-    assert "error: another process of this training has gone" in errors
+    assert "error: this training has lost one of its processes" in errors
     assert "--resume" in errors
     finish(*both(start, folder, "--resume"))
     assert_same_results(folder, whole)

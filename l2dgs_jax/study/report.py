@@ -84,5 +84,5 @@ def _plot(path: Path, members: Sequence[dict[str, Any]], folder: Path) -> None:
     ends.set(xlabel="held-out views, dB", yticks=range(len(members)))
     ends.set_yticklabels([member["name"] for member in members], fontsize=6)
     ends.invert_yaxis()
-    ends.legend(fontsize=6)
+    ends.legend(fontsize=6, loc="lower center", bbox_to_anchor=(0.5, 1), ncols=len(shown))
     figure.savefig(path, dpi=120, format="png")
