@@ -112,7 +112,8 @@ def random_like(tree, mask, key):
 
 
 @pytest.mark.parametrize(
-    ("preset", "moving"), [("paper", True), ("authors", True), ("default", True), ("paper", False)]
+    ("preset", "moving"),
+    [("paper", True), pytest.param("authors", True, marks=pytest.mark.slow), ("default", True), ("paper", False)],
 )
 def test_gradient_of_the_whole_objective_by_directional_differences(dataset, preset, moving):
     value_and_grad, params, probe = objective_of(dataset, tiny(preset), moving)
@@ -210,13 +211,6 @@ def test_a_resumed_run_equals_the_uninterrupted_one(dataset, finished, tmp_path)
         assert_equal_states(finish(dataset, config, state, pair_capacity).states, finished.states)
 
 
-def test_a_stage_compiles_once(dataset):
-    config = tiny(density=DensityConfig(start=1000))
-    compiled = engine.train_steps._cache_size()
-    finish(dataset, config, pair_capacity=8192)
-    assert engine.train_steps._cache_size() == compiled + 2
-
-
 def test_a_small_pair_buffer_grows_and_changes_nothing(dataset, finished):
     small = finish(dataset, tiny(), pair_capacity=8)
     assert small.pair_capacity > 8
@@ -224,11 +218,12 @@ def test_a_small_pair_buffer_grows_and_changes_nothing(dataset, finished):
         np.testing.assert_allclose(x, y, rtol=1e-6, atol=1e-9)
 
 
-def test_dead_rows_are_inert(dataset):
+def test_a_stage_compiles_once_and_dead_rows_are_inert(dataset):
     config = tiny(density=DensityConfig(start=1000))
-    state = engine.initial_state(dataset, config)
-    wide = state_of(finish(dataset, config, step.with_capacity(state, 2000)))
-    plain = state_of(finish(dataset, config))
+    compiled = engine.train_steps._cache_size()
+    plain = state_of(finish(dataset, config, pair_capacity=8192))
+    assert engine.train_steps._cache_size() == compiled + 2
+    wide = state_of(finish(dataset, config, step.with_capacity(engine.initial_state(dataset, config), 2000), 8192))
     rows = plain.scene.alive.shape[0]
     for x, y in zip(*map(jax.tree.leaves, (plain.scene.params.gaussians, wide.scene.params.gaussians)), strict=True):
         np.testing.assert_allclose(x, y[:rows], rtol=1e-6, atol=1e-9)
