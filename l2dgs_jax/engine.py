@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 from jax.sharding import PartitionSpec as P
-from jaxtyping import Array, Bool, Int, PyTree
+from jaxtyping import Array, Int, PyTree
 
 from l2dgs_jax import devices, networks, overrides
 from l2dgs_jax.config import Config
@@ -21,7 +21,7 @@ from l2dgs_jax.data.stacks import pixel_mean
 from l2dgs_jax.devices import MEMBERS, VIEWS
 from l2dgs_jax.rasterizer import count_pairs
 from l2dgs_jax.scene import initialise, observed_colors, rung
-from l2dgs_jax.step import Batch, StepReport, TrainState, begin_stage, densify, train_step, with_capacity
+from l2dgs_jax.step import Batch, StepReport, TrainState, begin_stage, choose, densify, train_step, with_capacity
 from l2dgs_jax.threads import in_order
 from l2dgs_jax.tone import Darkening, darkening
 from l2dgs_jax.types import Camera, Scene
@@ -154,7 +154,7 @@ class Tally(NamedTuple):
 
     Attributes:
         pairs: the most pairs that a member needs which was to take the step.
-        left: number of members that have taken it.
+        left: number of members that have taken it or are past it.
     """
 
     pairs: Int[Array, ""]
@@ -204,7 +204,7 @@ def begin_fine_stage(
 
     def begin(step, state, values):
         fresh = begin_stage(state.scene, state.step, overrides.replace(config, values), config.fine_steps)
-        return _where(state.step == step, fresh, state)
+        return choose(state.step == step, fresh, state)
 
     return _each_member(begin, mesh, step, states, values)
 
@@ -225,7 +225,7 @@ def _densify_all(states, values, step, *, config, mesh):
     def grow(step, state, values):
         grown, rows = densify(state, overrides.replace(config, values))
         due = state.step == step
-        return _where(due, grown, state), jnp.where(due, rows, 0)
+        return choose(due, grown, state), jnp.where(due, rows, 0)
 
     grown, rows = _each_member(grow, mesh, step, states, values)
     return grown, rows.max()
@@ -252,10 +252,6 @@ def _each_member(function: Callable, mesh: Mesh | None, step: Int[Array, ""] | i
         return here(step, *trees)
     specs = (P(), P(MEMBERS), P(MEMBERS), P(MEMBERS, VIEWS))[: 1 + len(trees)]
     return jax.shard_map(here, mesh=mesh, in_specs=specs, out_specs=P(MEMBERS), check_vma=False)(step, *trees)
-
-
-def _where(condition: Bool[Array, ""], new: T, old: T) -> T:
-    return jax.tree.map(partial(jnp.where, condition), new, old)
 
 
 def _stack(trees: Sequence[T]) -> T:

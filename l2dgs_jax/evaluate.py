@@ -1,7 +1,6 @@
 """`python -m l2dgs_jax.evaluate RUN`: how well the views of a run match the input and, where known, the truth."""
 
 import dataclasses
-import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +14,7 @@ from l2dgs_jax import cli, metrics, runs
 from l2dgs_jax.data.dataset import Split
 from l2dgs_jax.data.stacks import FileStack, pixel_mean, stacked
 from l2dgs_jax.errors import UserError
-from l2dgs_jax.files import replacing
+from l2dgs_jax.files import write_json
 from l2dgs_jax.metrics import RegionScore
 from l2dgs_jax.render import choose_split, views
 from l2dgs_jax.runs import Run
@@ -46,8 +45,7 @@ def main(arguments: Sequence[str]) -> None:
     result = evaluate(runs.open_run(options.run, options.stage), options.split)
     print(table(result))
     if options.json:
-        with replacing(options.json) as temporary:
-            temporary.write_text(json.dumps(result, indent=2) + "\n")
+        write_json(options.json, result)
 
 
 def evaluate(run: Run, split_name: str = "test") -> dict:

@@ -1,10 +1,12 @@
 """Files and folders that are written whole or not at all."""
 
 import contextlib
+import json
 import os
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 from l2dgs_jax.errors import UserError
 
@@ -64,11 +66,26 @@ def new_folder(path: Path) -> Iterator[Path]:
         raise UserError(f"{path}: cannot be written ({error.strerror}); expected a writable place") from None
 
 
+def write_json(path: Path, content: Any) -> None:
+    """Write what JSON can hold, whole or not at all.
+
+    Raises:
+        UserError: as `replacing`.
+    """
+    with replacing(path) as temporary:
+        temporary.write_text(json.dumps(content, indent=2) + "\n")
+
+
+def is_taken(path: Path) -> bool:
+    """Whether something is there already, other than an empty folder."""
+    return path.exists() and (not path.is_dir() or any(path.iterdir()))
+
+
 def expect_new(path: Path) -> None:
     """Complain early of what `new_folder` would complain of.
 
     Raises:
         UserError: `path` exists and is no empty folder.
     """
-    if path.is_symlink() or (path.exists() and (not path.is_dir() or any(path.iterdir()))):
+    if path.is_symlink() or is_taken(path):
         raise UserError(f"{path}: exists already; expected a new or an empty folder to write to")

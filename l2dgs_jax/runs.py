@@ -9,7 +9,7 @@ from l2dgs_jax.config import Config, from_dict, to_dict
 from l2dgs_jax.data import load
 from l2dgs_jax.data.dataset import Dataset
 from l2dgs_jax.errors import UserError
-from l2dgs_jax.files import make_folder, replacing
+from l2dgs_jax.files import make_folder, write_json
 from l2dgs_jax.rendering import Renderer
 from l2dgs_jax.step import TrainState, sh_degree
 
@@ -61,8 +61,7 @@ def write_settings(folder: Path, scene: str, config: Config) -> None:
         UserError: the folder cannot be made or written to.
     """
     make_folder(folder)
-    with replacing(folder / SETTINGS) as temporary:
-        temporary.write_text(json.dumps({"scene": scene, "settings": to_dict(config)}, indent=2) + "\n")
+    write_json(folder / SETTINGS, {"scene": scene, "settings": to_dict(config)})
 
 
 def read_settings(folder: Path) -> tuple[str, Config]:

@@ -182,7 +182,7 @@ def train_step(
     taken = report.finite & ~report.overflow
     if at is not None:
         taken &= state.step == at
-    return jax.tree.map(lambda new, old: jnp.where(taken, new, old), stepped, state), report
+    return choose(taken, stepped, state), report
 
 
 def adam(params: SceneParams, rates: dict[str, optim.Schedule], config: Config) -> optim.Transformation:
@@ -222,6 +222,11 @@ def with_capacity(state: TrainState, capacity: int) -> TrainState:
         stats=jax.tree.map(lambda x: pad_rows(x, capacity), state.stats),
         step=state.step,
     )
+
+
+def choose(condition: Bool[Array, ""], new: T, old: T) -> T:
+    """One tree or the other."""
+    return jax.tree.map(lambda new, old: jnp.where(condition, new, old), new, old)
 
 
 def _mean(tree: T, axis: str | None) -> T:

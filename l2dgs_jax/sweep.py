@@ -2,7 +2,7 @@
 
 import dataclasses
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -18,7 +18,7 @@ from l2dgs_jax.data.images import write_image
 from l2dgs_jax.engine import Member, Progress
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.evaluate import evaluate
-from l2dgs_jax.files import make_folder, replacing
+from l2dgs_jax.files import is_taken, make_folder, write_json
 from l2dgs_jax.hosts import Hosts
 from l2dgs_jax.recording import Recorder
 from l2dgs_jax.runs import Run
@@ -101,13 +101,12 @@ def _claim(output: Path, plans: Sequence[Plan], resume: bool) -> None:
             raise UserError(f"{output}: holds no study to resume; expected a folder that sweep wrote") from None
         if held != described:
             raise UserError(f"{output}: holds a study of other members or settings; expected the same file again")
-    elif output.exists() and (not output.is_dir() or any(output.iterdir())):
+    elif is_taken(output):
         raise UserError(f"{output}: already holds a study or files; expected a new folder, or --resume")
     hosts.meet("the folder is looked at")
     if jax.process_index() == 0 and not resume:
         make_folder(output)
-        with replacing(path) as temporary:
-            temporary.write_text(json.dumps(described, indent=2) + "\n")
+        write_json(path, described)
 
 
 def _mesh(group: Sequence[Entrant], device_count: int) -> Mesh | None:
@@ -139,20 +138,25 @@ def _train(group: Sequence[Entrant], output: Path, mesh: Mesh | None) -> None:
         for entrant in group:
             runs.write_settings(output / entrant.plan.name, entrant.plan.scene, entrant.config)
     hosts.meet("all folders are made")
-    followers: list[_Follower] = []
+    followers: list[_Follower] | None = None
     try:
-        for progress in engine.run(list(members.values()), pair_capacity, mesh):
-            if not followers:
+        for progress in _steps(list(members.values()), pair_capacity, mesh):
+            if followers is None:
                 own = [index for index in devices.own_rows(progress.states.step) if index < len(members)]
                 followers = [_Follower(output / list(members)[i], list(members.values())[i], i) for i in own]
             for follower in followers:
                 follower.follow(progress)
-    except engine.DivergedError as error:
-        for follower in followers:
-            follower.follow(error.progress)
     finally:
-        for follower in followers:
+        for follower in followers or ():
             follower.bar.close()
+
+
+def _steps(members: Sequence[Member], pair_capacity: int | None, mesh: Mesh | None) -> Iterator[Progress]:
+    """The steps of a training, also the one after which no member is left."""
+    try:
+        yield from engine.run(members, pair_capacity, mesh)
+    except engine.DivergedError as error:
+        yield error.progress
 
 
 class _Follower:
@@ -181,8 +185,7 @@ class _Follower:
         self.record.save(progress, self.index, runs.CHECKPOINT)
         terms = devices.row(progress.report.terms, self.index)
         found = {"step": progress.step - 1, "terms": {name: str(float(value)) for name, value in terms.items()}}
-        with replacing(self.folder / DIVERGED) as temporary:
-            temporary.write_text(json.dumps(found) + "\n")
+        write_json(self.folder / DIVERGED, found)
         self.bar.set_postfix_str(f"diverged at step {found['step']}, frozen")
 
 
@@ -202,8 +205,7 @@ def _score(entrant: Entrant, output: Path) -> None:
         "ended": f"diverged at step {int(state.step)}" if diverged else "finished",
         "scores": evaluate(run),
     }
-    with replacing(path) as temporary:
-        temporary.write_text(json.dumps(result, indent=2) + "\n")
+    write_json(path, result)
 
 
 if __name__ == "__main__":

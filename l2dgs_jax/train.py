@@ -18,6 +18,7 @@ from l2dgs_jax.data import load
 from l2dgs_jax.data.dataset import Dataset
 from l2dgs_jax.data.images import write_image
 from l2dgs_jax.errors import UserError
+from l2dgs_jax.files import is_taken
 from l2dgs_jax.hosts import Hosts
 from l2dgs_jax.recording import Recorder
 
@@ -117,7 +118,7 @@ def _parse(arguments: Sequence[str]) -> Train:
         if preset not in PRESETS:
             raise UserError(f"--preset {preset}: no such preset; expected one of {', '.join(PRESETS)}")
         base = PRESETS[preset]
-        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        if is_taken(folder):
             raise UserError(
                 f"{folder}: already holds another run or files; expected a new folder for --output, or --resume"
             )

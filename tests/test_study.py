@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scenes import write_nerfies
 
-from l2dgs_jax import cli, runs, sweep
+from l2dgs_jax import cli, engine, runs, sweep
 from l2dgs_jax.config import PRESETS
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.study import report
@@ -188,6 +188,18 @@ def test_a_folder_is_not_taken_from_others(refused, tmp_path):
 def test_bad_options_are_one_sentence(refused, tmp_path, arguments, naming):
     assert naming in refused(*arguments)
     assert not (tmp_path / "out").exists()
+
+
+def test_a_step_that_leaves_no_member_is_followed_too(monkeypatch):
+    """Even if it is the first: its members must be recorded as diverged."""
+    first, last = (engine.Progress(step, None, None, 8) for step in (1, 2))
+
+    def run(*_):
+        yield first
+        raise engine.DivergedError("not finite", last)
+
+    monkeypatch.setattr(engine, "run", run)
+    assert list(sweep._steps([], None, None)) == [first, last]
 
 
 def test_the_table_shows_what_was_varied_and_scored(tmp_path):

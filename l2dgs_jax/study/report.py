@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from l2dgs_jax import runs
-from l2dgs_jax.files import replacing
+from l2dgs_jax.files import replacing, write_json
 
 JSON, MARKDOWN, PLOTS = "results.json", "results.md", "results.png"
 RESULT = "result.json"  # in the folder of a member
@@ -27,8 +27,7 @@ def write(folder: Path, names: Sequence[str]) -> list[str]:
         UserError: the folder cannot be written to.
     """
     members = [{"name": name, **json.loads((folder / name / RESULT).read_text())} for name in names]
-    with replacing(folder / JSON) as temporary:
-        temporary.write_text(json.dumps({"members": members}, indent=2) + "\n")
+    write_json(folder / JSON, {"members": members})
     with replacing(folder / MARKDOWN) as temporary:
         temporary.write_text(markdown(members))
     try:
