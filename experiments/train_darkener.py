@@ -37,7 +37,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     cli.use_compilation_cache()
-    cli.keep_freed_memory()
+    cli.use_huge_pages()
 
     pictures = [read_image(path) for path in options.images] or [bundled(name) for name in PHOTOGRAPHS]
     planes = [lowlight.lightness(picture) for picture in pictures]

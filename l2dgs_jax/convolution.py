@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from l2dgs_jax.native import one_function
+from l2dgs_jax.native import by_platform, one_function
 
 LANES = 16  # values that a step of the loops computes side by side: a few vector registers
 TERMS = 8  # products added to each of them between two visits to memory
@@ -39,7 +39,7 @@ def _many(x, kernel):
 
 @jax.custom_vjp
 def _few(x, kernel):
-    return jax.lax.platform_dependent(x, kernel, cpu=_on_cpu, default=_many)
+    return by_platform(x, kernel, cpu=_on_cpu, default=_many)
 
 
 def _forward(x, kernel):
@@ -48,7 +48,7 @@ def _forward(x, kernel):
 
 def _backward(inputs, cotangent):
     pull = lambda x, kernel, cotangent: jax.vjp(_many, x, kernel)[1](cotangent)
-    return jax.lax.platform_dependent(*inputs, cotangent, cpu=_pull_on_cpu, default=pull)
+    return by_platform(*inputs, cotangent, cpu=_pull_on_cpu, default=pull)
 
 
 _few.defvjp(_forward, _backward)
@@ -116,23 +116,21 @@ def _pull_kernel_in_turn(x, cotangent, size):
                 pixels = _part(cotangent, (image, top, left, 0), (1, together, TERMS, outputs))[0]
                 pixels = pixels.swapaxes(0, 1).reshape(TERMS, LANES)
 
-                def add_terms(row, sums):
-                    first = (image, top + row, left * inputs)
-                    run = _part(x, first, (1, 1, (TERMS - 1) * inputs + window))[0, 0]
-                    in_row = jax.lax.dynamic_index_in_dim(sums, row, keepdims=False)
+                def with_terms(row, in_row):
+                    run = _part(x, (image, top + row, left * inputs), (1, 1, (TERMS - 1) * inputs + window))[0, 0]
                     for term in range(TERMS):
                         in_row += run[term * inputs : term * inputs + window][:, None] * pixels[term][None]
-                    return jax.lax.dynamic_update_index_in_dim(sums, in_row, row, 0)
+                    return in_row
 
-                return _loop(needed, add_terms, sums)
+                return tuple(with_terms(row, in_row) for row, in_row in enumerate(sums))
 
             # A sum of sums: added to the total one by one, small values would lose their last digits.
-            return total + _loop(runs, each_run, jnp.zeros_like(total))
+            return jax.tree.map(jnp.add, total, _loop(runs, each_run, jax.tree.map(jnp.zeros_like, total)))
 
-        return _loop(batch * blocks, each_rows, jnp.zeros((needed, window, LANES), x.dtype))
+        return _loop(batch * blocks, each_rows, (jnp.zeros((window, LANES), x.dtype),) * needed)
 
     total = _compiled(correlated)(_rows(x, size, below, right), cotangent)
-    total = total.reshape(needed, size, inputs, together, outputs)
+    total = jnp.stack(total).reshape(needed, size, inputs, together, outputs)
     return sum(total[row : row + size, :, :, row] for row in range(together))
 
 

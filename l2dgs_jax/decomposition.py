@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from l2dgs_jax.native import widen
+from l2dgs_jax.native import stage, widen
 from l2dgs_jax.networks import apply_bafe
 from l2dgs_jax.types import BAFENet, Decomposition
 
@@ -12,7 +12,8 @@ from l2dgs_jax.types import BAFENet, Decomposition
 def decompose(features: Float[Array, "*B H W 6"], bafe: BAFENet) -> Decomposition:
     """Turn blended features into L_w, R_w, B1, B2, I_w and the estimate of I_d.
 
-    Gradients flow to `features` (L_w and R_w: only where they lie in [0, 1], both ends included) and to `bafe`.
+    Gradients flow, in reverse mode only, to `features` (L_w and R_w: only where they lie in [0, 1], both ends included)
+    and to `bafe`.
 
     Args:
         features: blended l, r (three channels), b1, b2, in this order, any real values (Eqs. 5, 6, 8).
@@ -21,9 +22,10 @@ def decompose(features: Float[Array, "*B H W 6"], bafe: BAFENet) -> Decompositio
     Returns:
         The images of Eqs. 5-9; a base of 0 stays 0 in the low-light image and passes no gradient to its exponent.
     """
-    illumination = clip_unit(features[..., 0])
-    reflectance = clip_unit(features[..., 1:4])
-    attenuation = apply_bafe(bafe, features[..., 4:6])
+    # A stage, or the losses' gradient would be computed again for each of the channels.
+    illumination, reflectance, attenuation = stage(lambda x: (x[..., 0], x[..., 1:4], x[..., 4:6]))(features)
+    illumination, reflectance = clip_unit(illumination), clip_unit(reflectance)
+    attenuation = apply_bafe(bafe, attenuation)
     return Decomposition(
         welllit=widen(illumination, 3) * reflectance,
         lowlight=widen(power(illumination, attenuation[..., 1]), 3) * power(reflectance, widen(attenuation[..., 0], 3)),

@@ -1,6 +1,8 @@
 """The devices that a training is spread over, in one process or several."""
 
+import contextlib
 import itertools
+import os
 from collections.abc import Iterator
 from typing import TypeVar
 
@@ -13,6 +15,23 @@ from jaxtyping import Array, PyTree
 MEMBERS, VIEWS = "members", "views"
 
 T = TypeVar("T")
+
+
+def one_per_core() -> None:
+    """Make every processor core a device of its own, unless the user or a caller has settled how many there are.
+
+    XLA runs most loops of a program on one core. Two programs, each with a view of the step, keep two cores busy.
+    """
+    chosen = jax.config.jax_num_cpu_devices  # type: ignore[attr-defined]
+    if chosen < 0 and "host_platform_device_count" not in os.environ.get("XLA_FLAGS", ""):
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        with contextlib.suppress(RuntimeError):  # too late: the process has used jax before
+            jax.config.update("jax_num_cpu_devices", cores)
+
+
+def shares(views: int) -> int:
+    """The most devices that share a batch of so many views evenly."""
+    return max(count for count in range(1, jax.device_count() + 1) if views % count == 0)
 
 
 def mesh(members: int = 1, views: int = 1) -> Mesh | None:

@@ -20,7 +20,7 @@ from l2dgs_jax.data.dataset import Dataset, Split
 from l2dgs_jax.data.stacks import pixel_mean
 from l2dgs_jax.devices import MEMBERS, VIEWS
 from l2dgs_jax.rasterizer import count_pairs
-from l2dgs_jax.scene import initialise, observed_colors, rung
+from l2dgs_jax.scene import initialise, observed_colors, rung, z_order
 from l2dgs_jax.step import Batch, StepReport, TrainState, begin_stage, choose, densify, train_step, with_capacity
 from l2dgs_jax.threads import in_order
 from l2dgs_jax.tone import Darkening, darkening
@@ -83,7 +83,8 @@ def resolve(config: Config, split: Split) -> Config:
 
 def initial_state(dataset: Dataset, config: Config) -> TrainState:
     """The state before the first step of a `resolve`d config; the same seed and data give the same state."""
-    points, train = dataset.points, dataset.train
+    order, train = z_order(dataset.points), dataset.train
+    points, colors = dataset.points[order], None if dataset.colors is None else dataset.colors[order]
     capacity = len(points)
     if config.density.start < config.density.stop:
         capacity = rung(min(1.5 * capacity, max(config.density.max_gaussians, capacity)))
@@ -92,9 +93,7 @@ def initial_state(dataset: Dataset, config: Config) -> TrainState:
         law = split_darkening(train, config)
         observed = observed_colors(points, train.cameras, train.images, train.valid)
         reflectance = (observed / law.gain) ** (1 / law.exponent)
-    scene = initialise(
-        jax.random.key(config.seed), points, dataset.colors, train.cameras, config.model, capacity, reflectance
-    )
+    scene = initialise(jax.random.key(config.seed), points, colors, train.cameras, config.model, capacity, reflectance)
     return _begin_stage(scene, jnp.zeros((), jnp.int32), config, config.coarse_steps)
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from l2dgs_jax.config import ModelConfig
-from l2dgs_jax.native import add_row, one_function, read, read_row, widen, write_row
+from l2dgs_jax.native import add_row, by_platform, one_function, read, read_row, widen, write_row
 from l2dgs_jax.types import HexPlane
 
 # Axes (x, y, z = 0, 1, 2) of the space planes XY, YZ, ZX, and the axis of the time planes Zt, Xt, Yt paired with them.
@@ -183,9 +183,7 @@ _lookup.defvjp(_lookup_forward, _lookup_backward)
 def _by_platform(in_turn, at_once, cell):
     # A loop of one step would be unrolled, and `one_function` wants loops.
     cpu = in_turn if len(cell[0]) > 1 else at_once
-    return lambda layout, *arrays: jax.lax.platform_dependent(
-        *arrays, cpu=partial(cpu, layout), default=partial(at_once, layout)
-    )
+    return lambda layout, *arrays: by_platform(*arrays, cpu=partial(cpu, layout), default=partial(at_once, layout))
 
 
 def _tables_of_scale(layout, scale):

@@ -1,7 +1,7 @@
 """What XLA's CPU compiler compiles together, and what apart."""
 
 from collections.abc import Callable
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -31,6 +31,13 @@ def one_function(function: Callable[..., T]) -> Callable[..., T]:
     return lambda *arguments: call(*jax.lax.optimization_barrier(arguments))
 
 
+def by_platform(*arguments: Any, cpu: Callable[..., T], default: Callable[..., T]) -> T:
+    """`jax.lax.platform_dependent`, but where there is nothing but a CPU the other form is not even traced."""
+    if jax.default_backend() == "cpu":
+        return cpu(*arguments)
+    return jax.lax.platform_dependent(*arguments, cpu=cpu, default=default)
+
+
 def apart(function: Callable[..., T]) -> Callable[..., T]:
     """The same function, on CPU never merged with what calls it.
 
@@ -40,7 +47,7 @@ def apart(function: Callable[..., T]) -> Callable[..., T]:
     if not TRIED:
         return function
     separate = _call(function, inlineable="false")
-    return lambda *arguments: jax.lax.platform_dependent(*arguments, cpu=separate, default=function)
+    return lambda *arguments: by_platform(*arguments, cpu=separate, default=function)
 
 
 def stage(function: Callable[..., T]) -> Callable[..., T]:

@@ -43,6 +43,18 @@ def rung(count: float | int, *, base: int = 1024) -> int:
     return size
 
 
+def z_order(points: np.ndarray) -> np.ndarray:
+    """The order of points [P 3] along a Z-order curve (Morton, 1966).
+
+    What lies close in space then mostly lies close in memory, and looking up its features finds them in a cache.
+    """
+    bits = 10
+    low, span = points.min(0), max(float(np.ptp(points, axis=0).max()), 1e-30)
+    cells = ((points - low) / span * (2**bits - 1)).astype(np.int64)
+    places = (((cells[:, axis] >> bit) & 1) << (3 * bit + axis) for bit in range(bits) for axis in range(3))
+    return np.argsort(sum(places), kind="stable")
+
+
 def camera_extent(cameras: Camera) -> float:
     """1.1 times the largest distance of a camera centre from their mean, world units (as 3DGS and 4DGS)."""
     viewmat = np.asarray(cameras.viewmat, np.float64)

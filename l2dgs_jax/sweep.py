@@ -38,7 +38,7 @@ class Sweep:
         spec: TOML file with scenes, seeds and settings; the README shows one.
         output: folder for the study: a run in a folder of its own for each member, results.json, .md and .png.
         resume: continue the study in the output folder from its last checkpoints.
-        devices: how many devices the members are spread over; all if not given.
+        devices: how many devices the members are spread over, each core of a processor being one; all if not given.
         hosts: several processes.
     """
 
@@ -51,6 +51,7 @@ class Sweep:
 
 def main(arguments: Sequence[str]) -> None:
     """Sweep as the command line says."""
+    devices.one_per_core()
     options = cli.parse(Sweep, arguments, "sweep")
     if options.devices is not None and options.devices < 1:
         raise UserError(f"--devices {options.devices}: expected at least one")

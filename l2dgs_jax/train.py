@@ -32,7 +32,8 @@ class Train:
         preset: settings to start from (default, paper, authors or demo); the options below override single ones.
         output: run folder; a fresh one under runs/ if not given.
         resume: continue the run in the output folder from its last checkpoint.
-        devices: how many devices the views of a step are spread over.
+        devices: how many devices the views of a step are spread over; each core of a processor is one. If not given,
+            as many as share them evenly.
         hosts: several processes.
     """
 
@@ -40,13 +41,14 @@ class Train:
     preset: str | None = None
     output: Path | None = None
     resume: bool = False
-    devices: int = 1
+    devices: int | None = None
     hosts: Annotated[Hosts, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Hosts)
     config: Annotated[Config, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Config)
 
 
 def train(arguments: Sequence[str]) -> None:
     """Train as the command line says."""
+    devices.one_per_core()
     options = _parse(arguments)
     with hosts.together(options.hosts):
         hosts.meet("the options are checked")
@@ -97,12 +99,13 @@ def _record(steps: Iterator[engine.Progress], dataset: Dataset, options: Train, 
 def _mesh(options: Train) -> Mesh | None:
     """The devices that the views of a step are spread over."""
     views = options.config.batch_size
-    if options.devices < 1 or views % options.devices:
-        raise UserError(f"--devices {options.devices}: expected a number that divides --batch-size, which is {views}")
+    count = devices.shares(views) if options.devices is None else options.devices
+    if count < 1 or views % count:
+        raise UserError(f"--devices {count}: expected a number that divides --batch-size, which is {views}")
     try:
-        return devices.mesh(views=options.devices)
+        return devices.mesh(views=count)
     except ValueError as error:
-        raise UserError(f"--devices {options.devices}: {error}; expected what there is") from None
+        raise UserError(f"--devices {count}: {error}; expected what there is") from None
 
 
 def _parse(arguments: Sequence[str]) -> Train:

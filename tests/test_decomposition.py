@@ -68,7 +68,7 @@ def test_the_low_light_image_is_never_brighter():
 
 def test_gradients_of_the_images():
     features, bafe = make_features(2, 4, 5), make_bafe()
-    check_grads(jax.jit(decompose), (features, bafe), 1, ("fwd", "rev"), 1e-5, 1e-5, eps=1e-6)
+    check_grads(jax.jit(decompose), (features, bafe), 1, ("rev",), 1e-5, 1e-5, eps=1e-6)
 
 
 def test_gradients_of_power():

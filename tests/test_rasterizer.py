@@ -131,6 +131,7 @@ def test_an_image_of_one_pixel():
 def test_the_form_for_accelerators_agrees(monkeypatch):
     arrays = scene(13)
     values, gradients = fast(*arrays)
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     monkeypatch.setattr(jax.lax, "platform_dependent", lambda *x, cpu, default: default(*x))
 
     def draw(*arrays, width, height):  # with a capacity of its own, or the compiled CPU form would be found and run

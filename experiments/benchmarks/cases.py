@@ -16,14 +16,14 @@ import numpy as np
 from experiments.benchmarks.native import NativeBlend
 from experiments.benchmarks.scenes import cloud, fine_state, training, video
 from experiments.benchmarks.stopwatch import best_of, peak_memory, resident_memory
-from l2dgs_jax import engine, hexplane, losses, networks
+from l2dgs_jax import devices, engine, hexplane, losses, networks
 from l2dgs_jax.config import PRESETS
 from l2dgs_jax.decomposition import decompose
 from l2dgs_jax.deformation import deform
 from l2dgs_jax.rasterizer import count_pairs, rasterize
 from l2dgs_jax.rendering import Renderer
 from l2dgs_jax.scene import rung
-from l2dgs_jax.step import adam, train_step
+from l2dgs_jax.step import adam
 from l2dgs_jax.threads import in_order
 from l2dgs_jax.types import Camera, MovedGaussians, RenderOutput, Scene
 
@@ -43,8 +43,6 @@ SCALES = (  # Gaussians, frames, width, height
     (200_000, 1_000, 800, 450),
     (500_000, 300, 400, 225),
 )
-
-_step = jax.jit(train_step, static_argnames=("config", "moving", "pair_capacity"), donate_argnums=0)
 
 
 def rasterizer() -> Figures:
@@ -139,7 +137,7 @@ def parts() -> Figures:
 
 
 def step() -> Figures:
-    """The whole fine step: loss, gradient and Adam, two views."""
+    """The whole fine step as `train` takes it: loss, gradient and Adam, two views, on two devices where there are."""
     figures = {}
     for name, size in STEPS.items():
         take = _stepper(*size)
@@ -226,15 +224,26 @@ def _pairs(moved: MovedGaussians, cameras: Camera, width: int, height: int) -> i
     return int(count_pairs(*geometry, cameras.viewmat, cameras.K, width, height))
 
 
-def _stepper(count: int, width: int, height: int, margin: float = 1.1) -> Callable[[], Any]:
+def _stepper(count: int, width: int, height: int, margin: float = 1.1, moving: bool = True) -> Callable[[], Any]:
     """Takes the next training step at every call; the pair buffer holds `margin` times what the first one needs."""
     state, batch = training(count, width, height, CONFIG)
+    views = len(batch.images)
     moved = _move(state.scene, batch.cameras)
-    capacity = rung(margin * _pairs(moved, batch.cameras, width, height))
+    one = lambda tree, view: jax.tree.map(lambda x: x[view : view + 1], tree)
+    pairs = [_pairs(one(moved, view), one(batch.cameras, view), width, height) for view in range(views)]
+    mesh = devices.mesh(views=devices.shares(views))
+    capacity = rung(margin * np.reshape(pairs, (devices.shares(views), -1)).sum(1).max())
+    alone = lambda tree: jax.tree.map(lambda x: x[None], tree)
+    states = devices.place(alone(jax.tree.map(jnp.array, state)), mesh, devices.MEMBERS)
+    batches = devices.place(alone(batch), mesh, devices.MEMBERS, devices.VIEWS)
+    step = int(state.step)
 
     def take():
-        nonlocal state
-        state, report = _step(state, batch, CONFIG, moving=True, pair_capacity=capacity)
+        nonlocal states, step
+        states, report, _ = engine.train_steps(
+            states, batches, {}, step, config=CONFIG, moving=moving, pair_capacity=capacity, mesh=mesh
+        )
+        step += 1
         if report.overflow or not report.finite:
             raise RuntimeError("the measured step was refused")
         return report
@@ -245,8 +254,8 @@ def _stepper(count: int, width: int, height: int, margin: float = 1.1) -> Callab
 def _child(name: str, *arguments: str) -> str:
     """What a function of this module prints in a process of its own."""
     program = (
-        "import sys; from experiments.benchmarks import cases; from l2dgs_jax.cli import keep_freed_memory; "
-        f"keep_freed_memory(); cases._{name}(*sys.argv[1:])"
+        "import sys; from l2dgs_jax.devices import one_per_core; one_per_core(); "
+        f"from experiments.benchmarks import cases; cases._{name}(*sys.argv[1:])"
     )
     done = subprocess.run([sys.executable, "-c", program, *arguments], check=True, capture_output=True, text=True)
     return done.stdout.splitlines()[-1]
@@ -255,10 +264,9 @@ def _child(name: str, *arguments: str) -> str:
 def _first_step(folder: str, stage: str) -> None:
     jax.config.update("jax_compilation_cache_dir", folder)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
-    state, batch = training(7_000, 200, 112, CONFIG)
+    take = _stepper(7_000, 200, 112, margin=2, moving=stage == "fine")
     start = time.perf_counter()
-    moving, capacity = stage == "fine", rung(200_000)
-    jax.block_until_ready(_step(state, batch, CONFIG, moving=moving, pair_capacity=capacity))
+    take()
     print(time.perf_counter() - start)
 
 
@@ -283,5 +291,6 @@ def _training(count: str, frames: str, width: str, height: str, place: str) -> N
     dataset = video(int(count), int(width), int(height), int(frames), in_file=place == "file")
     config = dataclasses.replace(CONFIG, coarse_steps=0, fine_steps=6)
     member = engine.Member(dataset.train, config, fine_state(dataset, config))
-    times = [time.perf_counter() for _ in engine.run([member])]
+    mesh = devices.mesh(views=devices.shares(config.batch_size))
+    times = [time.perf_counter() for _ in engine.run([member], mesh=mesh)]
     print(1e3 * min(np.diff(times)), peak_memory())

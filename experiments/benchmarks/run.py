@@ -9,7 +9,8 @@ import tyro
 
 from experiments.benchmarks.cases import CASES
 from experiments.benchmarks.stopwatch import machine
-from l2dgs_jax.cli import keep_freed_memory
+from l2dgs_jax import devices
+from l2dgs_jax.cli import use_huge_pages
 
 BASELINE = Path(__file__).with_name("baseline.json")
 TOLERANCE = 1.3  # machines are shared: a smaller ratio is noise
@@ -32,7 +33,8 @@ def main() -> None:
     unknown = set(options.cases) - set(CASES)
     if unknown:
         raise SystemExit(f"error: no case {', '.join(sorted(unknown))}; expected some of {', '.join(CASES)}")
-    keep_freed_memory()
+    use_huge_pages()
+    devices.one_per_core()
     baseline = json.loads(BASELINE.read_text()) if BASELINE.exists() else {"machine": {}, "figures": {}}
     report = {"machine": machine(), "figures": {}}
     print(json.dumps(report["machine"]))

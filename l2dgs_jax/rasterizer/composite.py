@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from l2dgs_jax.native import add_rows_in_turn, one_function
+from l2dgs_jax.native import add_rows_in_turn, by_platform, one_function
 from l2dgs_jax.rasterizer.intersect import MIN_ALPHA, TILE, TileLists, grid
 
 MAX_ALPHA = 0.999
@@ -78,7 +78,7 @@ def _by_platform(draw: Callable[..., Array], width: int, height: int) -> Callabl
         parallel = partial(draw, add_rows=lambda table, ids, rows: table.at[ids].add(rows))
         return _in_blocks(parallel, ACCELERATOR_BLOCK, packed, lists, images, columns, rows)
 
-    return _fold(lambda *arguments: jax.lax.platform_dependent(*arguments, cpu=cpu, default=default))
+    return _fold(lambda *arguments: by_platform(*arguments, cpu=cpu, default=default))
 
 
 def _fold(function: Callable[..., Array]) -> Callable[..., Array]:

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from l2dgs_jax.native import one_function, read, write
+from l2dgs_jax.native import by_platform, one_function, read, write
 from l2dgs_jax.projection import Projected
 from l2dgs_jax.rasterizer.sorting import argsort, group
 
@@ -116,7 +116,7 @@ def intersect(projected: Projected, boxes: Footprints, width: int, height: int, 
     forms = [partial(form, **listing) for form in (_list_in_turn, _list_at_once)]
     # XLA aborts on an argument of `one_function` that its simplifications leave unused, as they might for one row.
     cpu, default = forms if views * count > 1 else (forms[1], forms[1])
-    tile, slot = jax.lax.platform_dependent(box, shape, cpu=cpu, default=default)
+    tile, slot = by_platform(box, shape, cpu=cpu, default=default)
     tile, rank, starts = group(tile, slot % count, views * tiles, count)
     slot = jnp.minimum(tile // tiles, views - 1) * count + rank
     return TileLists(order[jnp.minimum(slot, views * count - 1)], starts[:-1], starts[1:])

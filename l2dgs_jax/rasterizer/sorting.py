@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from l2dgs_jax.native import apart, one_function, read, write
+from l2dgs_jax.native import apart, by_platform, one_function, read, write
 
 DIGIT = 11  # bits that a pass of the radix sort looks at
 BUCKETS = 2**DIGIT
@@ -15,7 +15,7 @@ def argsort(values: Float[Array, " N"]) -> Int[Array, " N"]:
     by_comparing = lambda values: jnp.argsort(values).astype(jnp.int32)
     if values.shape[0] < 2:
         return by_comparing(values)
-    return jax.lax.platform_dependent(values, cpu=_radix_argsort, default=by_comparing)
+    return by_platform(values, cpu=_radix_argsort, default=by_comparing)
 
 
 def group(
@@ -31,7 +31,7 @@ def group(
     """
     by_counting = lambda tiles, ranks: _by_counting(tiles, ranks, tile_count)
     by_comparing = lambda tiles, ranks: _by_comparing(tiles, ranks, tile_count, rank_count)
-    return jax.lax.platform_dependent(tiles, ranks, cpu=by_counting, default=by_comparing)
+    return by_platform(tiles, ranks, cpu=by_counting, default=by_comparing)
 
 
 def _by_comparing(tiles, ranks, tile_count, rank_count):
