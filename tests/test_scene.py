@@ -143,10 +143,10 @@ def test_padding_appends_zero_rows():
 def test_the_z_order_keeps_neighbours_together():
     grid = np.stack(np.meshgrid(*[np.arange(8.0)] * 3), axis=-1).reshape(-1, 3)
     shuffled = grid[np.random.default_rng(0).permutation(len(grid))]
-    ordered = shuffled[z_order(shuffled)]
+    ordered = shuffled[scene.z_order(shuffled)]
     np.testing.assert_array_equal(np.unique(ordered, axis=0), np.unique(grid, axis=0))
     # Every 8 and every 64 points in a row fill a cube of 2 and of 4 points an edge.
     for size in (2, 4):
         cubes = ordered.reshape(-1, size**3, 3)
         np.testing.assert_array_equal(np.ptp(cubes, axis=1), size - 1)
-    np.testing.assert_array_equal(z_order(np.ones((3, 3))), np.arange(3))
+    np.testing.assert_array_equal(scene.z_order(np.ones((3, 3))), np.arange(3))
