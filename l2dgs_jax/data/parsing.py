@@ -40,7 +40,9 @@ def read_array(path: Path, what: str) -> np.ndarray:
     if not os.path.isfile(path):
         raise UserError(f"{path}: no such file; expected {what}")
     try:
-        values = np.load(path, allow_pickle=False)
+        # Opened here, because numpy leaves some damaged files open.
+        with open(path, "rb") as file:
+            values = np.load(file, allow_pickle=False)
     except Exception as error:  # a damaged header makes NumPy raise any of a dozen kinds
         reason = str(error).partition("\n")[0]
         raise UserError(f"{path}: not a NumPy array of numbers ({reason}); expected {what}") from None
