@@ -48,7 +48,7 @@ def use_compilation_cache() -> None:
 def use_huge_pages() -> None:
     """Start the program anew with glibc asking Linux for huge pages, which it can only be told at the start.
 
-    XLA's temporaries are mapped anew in every step; in pages of 4 KiB that takes a third of the step's time.
+    XLA's temporaries are mapped anew in every step; in pages of 4 KiB that takes more than a quarter of its time.
     """
     tunables = os.environ.get("GLIBC_TUNABLES", "")
     if sys.platform == "linux" and "glibc.malloc.hugetlb" not in tunables:
