@@ -14,15 +14,18 @@ from l2dgs_jax.errors import UserError
 T = TypeVar("T")
 
 
-def main(command: Callable[[Sequence[str]], None], arguments: Sequence[str] | None = None) -> None:
-    """Run a command: a user's mistake becomes one sentence on standard error and exit code 2."""
-    if arguments is None:
-        arguments = sys.argv[1:]
-        if not {"-h", "--help"} & set(arguments):
-            use_huge_pages()
+def main(
+    command: Callable[[Sequence[str]], None], arguments: Sequence[str] | None = None, *, huge_pages: bool = False
+) -> None:
+    """Run a command: a user's mistake becomes one sentence on standard error and exit code 2.
+
+    `huge_pages` is for commands that compute for long: it makes the program start twice.
+    """
+    if huge_pages and not {"-h", "--help"} & set(sys.argv):
+        use_huge_pages()
     use_compilation_cache()
     try:
-        command(arguments)
+        command(sys.argv[1:] if arguments is None else arguments)
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)

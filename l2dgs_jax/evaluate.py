@@ -154,4 +154,4 @@ def _compare(
 
 
 if __name__ == "__main__":
-    cli.main(main)
+    cli.main(main, huge_pages=True)

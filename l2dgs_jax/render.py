@@ -104,4 +104,4 @@ def _make_folder(folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    cli.main(render)
+    cli.main(render, huge_pages=True)

@@ -210,4 +210,4 @@ def _score(entrant: Entrant, output: Path) -> None:
 
 
 if __name__ == "__main__":
-    cli.main(main)
+    cli.main(main, huge_pages=True)

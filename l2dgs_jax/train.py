@@ -157,4 +157,4 @@ def _consume(steps: Iterator[engine.Progress], folder: Path, config: Config, don
 
 
 if __name__ == "__main__":
-    cli.main(train)
+    cli.main(train, huge_pages=True)

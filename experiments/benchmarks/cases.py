@@ -231,8 +231,9 @@ def _stepper(count: int, width: int, height: int, margin: float = 1.1, moving: b
     moved = _move(state.scene, batch.cameras)
     one = lambda tree, view: jax.tree.map(lambda x: x[view : view + 1], tree)
     pairs = [_pairs(one(moved, view), one(batch.cameras, view), width, height) for view in range(views)]
-    mesh = devices.mesh(views=devices.shares(views))
-    capacity = rung(margin * np.reshape(pairs, (devices.shares(views), -1)).sum(1).max())
+    shares = devices.shares(views)
+    mesh = devices.mesh(views=shares)
+    capacity = rung(margin * np.reshape(pairs, (shares, -1)).sum(1).max())
     alone = lambda tree: jax.tree.map(lambda x: x[None], tree)
     states = devices.place(alone(jax.tree.map(jnp.array, state)), mesh, devices.MEMBERS)
     batches = devices.place(alone(batch), mesh, devices.MEMBERS, devices.VIEWS)
