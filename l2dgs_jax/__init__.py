@@ -1,25 +1,44 @@
 """Low-light dynamic Gaussian splatting (L2DGS, CVPR 2026) in JAX: a dark video in, a well-lit 4D scene out."""
 
+from importlib.metadata import version
+
+from l2dgs_jax.cameras import resize
 from l2dgs_jax.config import PRESETS, Config
-from l2dgs_jax.data import load
+from l2dgs_jax.data import Dataset, Split, load_dataset
 from l2dgs_jax.errors import UserError
+from l2dgs_jax.kernels import use_kernels
 from l2dgs_jax.rasterizer import rasterize
-from l2dgs_jax.rendering import Renderer
-from l2dgs_jax.runs import open_run
-from l2dgs_jax.types import Camera, Gaussians, RasterOutput, RenderOutput, Scene, SceneParams
+from l2dgs_jax.runs import Checkpoint, Recorder, Run, fit, open_run
+from l2dgs_jax.training import DivergedError, Progress, StepReport, TrainState
+from l2dgs_jax.types import Camera, Decomposition, Gaussians, RasterOutput, RenderOutput, Scene, SceneParams
+
+__version__ = version("l2dgs-jax")
 
 __all__ = [
     "PRESETS",
     "Camera",
+    "Checkpoint",
     "Config",
+    "Dataset",
+    "Decomposition",
+    "DivergedError",
     "Gaussians",
+    "Progress",
     "RasterOutput",
+    "Recorder",
     "RenderOutput",
-    "Renderer",
+    "Run",
     "Scene",
     "SceneParams",
+    "Split",
+    "StepReport",
+    "TrainState",
     "UserError",
-    "load",
+    "__version__",
+    "fit",
+    "load_dataset",
     "open_run",
     "rasterize",
+    "resize",
+    "use_kernels",
 ]

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import tyro
 
-from l2dgs_jax import cli
 from l2dgs_jax.config import Layout, LayoutName
-from l2dgs_jax.data import LAYOUTS, load
+from l2dgs_jax.data import LAYOUTS, load_dataset
+from l2dgs_jax.runtime import command_line
 
 
 @dataclass(frozen=True)
@@ -32,10 +32,10 @@ class Convert:
     held_out: str = "auto"
 
 
-def convert(arguments: Sequence[str]) -> None:
+def main(arguments: Sequence[str]) -> None:
     """Convert as the command line says."""
-    options = cli.parse(Convert, arguments, "convert")
-    dataset = load(options.scene, options.downscale, options.format, options.held_out)
+    options = command_line.parse(Convert, arguments, "convert")
+    dataset = load_dataset(options.scene, options.downscale, options.format, options.held_out)
     for note in dataset.notes:
         print(f"note: {note}")
     LAYOUTS[options.to].write(dataset, options.output)
@@ -46,4 +46,4 @@ def convert(arguments: Sequence[str]) -> None:
 
 
 if __name__ == "__main__":
-    cli.main(convert)
+    command_line.run(main)

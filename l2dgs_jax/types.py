@@ -170,7 +170,7 @@ class RasterOutput(NamedTuple):
     Attributes:
         features: alpha-blended feature channels, no background.
         alpha: accumulated opacity, 1 - final transmittance.
-        depth: sum of w z over the Gaussians of a pixel, world units, not divided by alpha.
+        depth: as `depth_mode` says, world units; 0 where nothing is drawn.
         means2d: projected centres in pixels.
         radii: half-widths in pixels of the box that a Gaussian's visible ellipse fills; 0 where it is not drawn.
         pairs: how many (Gaussian, tile) pairs the scene needs.

@@ -11,10 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 from scenes import write_image, write_nerfies
 
-from l2dgs_jax import checkpoint, engine, runs
-from l2dgs_jax.checkpoint import Checkpoint
+from l2dgs_jax import runs
 from l2dgs_jax.config import PRESETS
-from l2dgs_jax.data import load
+from l2dgs_jax.data import load_dataset
+from l2dgs_jax.runs import checkpoints
+from l2dgs_jax.runs.checkpoints import Checkpoint
+from l2dgs_jax.training import initial_state, resolve
 
 WIDTH, HEIGHT, FRAMES = 24, 18, 10
 HELD_OUT = (2, 6)  # every fourth frame
@@ -35,13 +37,13 @@ def folder(base):
         hidden=8,
         identity_start=False,
     )
-    dataset = load(scene)
-    config = engine.resolve(dataclasses.replace(preset, coarse_steps=3, fine_steps=3, model=model), dataset.train)
+    dataset = load_dataset(scene)
+    config = resolve(dataclasses.replace(preset, coarse_steps=3, fine_steps=3, model=model), dataset.train)
     path = base / "tiny_run"
     runs.write_settings(path, str(scene), config)
-    state = engine.initial_state(dataset, config)
+    state = initial_state(dataset, config)
     for name, step in ((runs.COARSE, config.coarse_steps), (runs.CHECKPOINT, config.steps)):
-        checkpoint.save(path / name, Checkpoint(state._replace(step=jnp.asarray(step, jnp.int32)), 1024), config)
+        checkpoints.save(path / name, Checkpoint(state._replace(step=jnp.asarray(step, jnp.int32)), 1024), config)
     return path
 
 

@@ -16,15 +16,18 @@ import numpy as np
 from experiments.benchmarks.native import NativeBlend
 from experiments.benchmarks.scenes import cloud, fine_state, training, video
 from experiments.benchmarks.stopwatch import best_of, peak_memory, resident_memory
-from l2dgs_jax import devices, engine, hexplane, losses, networks
 from l2dgs_jax.config import PRESETS
-from l2dgs_jax.decomposition import decompose
-from l2dgs_jax.deformation import deform
+from l2dgs_jax.config.overrides import StaticConfig
+from l2dgs_jax.model import channels, hexplane, networks
+from l2dgs_jax.model.decomposition import decompose
+from l2dgs_jax.model.deformation import deform
+from l2dgs_jax.model.rendering import Renderer
 from l2dgs_jax.rasterizer import count_pairs, rasterize
-from l2dgs_jax.rendering import Renderer
-from l2dgs_jax.scene import rung
-from l2dgs_jax.step import adam
-from l2dgs_jax.threads import in_order
+from l2dgs_jax.runtime import devices
+from l2dgs_jax.runtime.capacity import next_capacity
+from l2dgs_jax.runtime.prefetch import prefetch
+from l2dgs_jax.training import engine, losses
+from l2dgs_jax.training.step import adam
 from l2dgs_jax.types import Camera, MovedGaussians, RenderOutput, Scene
 
 Figures = dict[str, float]
@@ -82,7 +85,7 @@ def folding() -> Figures:
     for scene, count in zip(scenes, counts, strict=True):
         scene["opacities"] = scene["opacities"].at[count:].set(0)
     names = ("means", "quats", "scales", "opacities", "features", "viewmat", "K")
-    capacity = rung(max(int(rasterize(*(s[n] for n in names), width, height).pairs) for s in scenes))
+    capacity = next_capacity(max(int(rasterize(*(s[n] for n in names), width, height).pairs) for s in scenes))
 
     def loss(*x):
         return sum(jnp.vdot(image, image) for image in rasterize(*x, width, height, pair_capacity=capacity)[:3])
@@ -104,15 +107,15 @@ def parts() -> Figures:
     move = lambda p: _move(scene._replace(params=p), batch.cameras)
     look = lambda p: hexplane.features(p.hexplane, p.gaussians.means, scene.bounds, batch.cameras.time, cfg)
     moved, field = move(params), jax.jit(look)(params)
-    channels = jnp.concatenate([moved.illumination[..., None], moved.reflectance, moved.attenuation], axis=-1)
-    capacity = rung(_pairs(moved, batch.cameras, width, height))
+    blended = channels.pack(moved.illumination, moved.reflectance, moved.attenuation)
+    capacity = next_capacity(_pairs(moved, batch.cameras, width, height))
 
-    def draw(moved, channels):
+    def draw(moved, features):
         geometry = (moved.means, moved.quats, moved.scales, moved.opacities)
         camera = (batch.cameras.viewmat, batch.cameras.K)
-        return rasterize(*geometry, channels, *camera, width, height, pair_capacity=capacity)
+        return rasterize(*geometry, features, *camera, width, height, pair_capacity=capacity)
 
-    drawn = jax.jit(draw)(moved, channels)
+    drawn = jax.jit(draw)(moved, blended)
 
     def judge(features, bafe):
         output = RenderOutput(decompose(features, bafe), *drawn[1:3], drawn.radii, drawn.pairs, drawn.overflow)
@@ -128,8 +131,8 @@ def parts() -> Figures:
         "hexplane_ms": _with_gradient(look, params),
         "heads_and_ocd_ms": _with_gradient(mlps, params.heads, params.ocd, field),
         "deform_ms": _with_gradient(move, params),
-        "rasterizer_ms": _with_gradient(lambda m, c: draw(m, c)[:3], moved, channels),
-        "bafe_ms": _with_gradient(networks.apply_bafe, params.bafe, drawn.features[..., 4:]),
+        "rasterizer_ms": _with_gradient(lambda m, c: draw(m, c)[:3], moved, blended),
+        "bafe_ms": _with_gradient(networks.apply_bafe, params.bafe, channels.unpack(drawn.features)[2]),
         "decompose_and_losses_ms": _with_gradient(judge, drawn.features, params.bafe),
         "plane_regularisers_ms": _with_gradient(hexplane.regularisers, params.hexplane),
         "adam_ms": best_of(lambda: update(params, state.adam)),
@@ -153,7 +156,7 @@ def rendering() -> Figures:
     cameras = [camera._replace(time=np.float32(t)) for t in np.linspace(0, 1, 40)]
     welllit = lambda camera: np.asarray(renderer.welllit(camera))
     both = lambda camera: np.asarray(renderer(camera).images.lowlight)
-    rate = lambda frame: 1e3 * len(cameras) / best_of(lambda: deque(in_order(frame, cameras), 0), 3)
+    rate = lambda frame: 1e3 * len(cameras) / best_of(lambda: deque(prefetch(frame, cameras), 0), 3)
     return {
         "welllit_frames_per_s": rate(welllit),
         "welllit_and_lowlight_frames_per_s": rate(both),
@@ -203,7 +206,7 @@ def _rasterizer(count: int, width: int, height: int) -> tuple[Callable, Callable
     learned = tuple(arrays[name] for name in ("means", "quats", "scales", "opacities", "features"))
     camera = (arrays["viewmat"], arrays["K"])
     pairs = int(rasterize(*learned, *camera, width, height).pairs)
-    draw = lambda *x: rasterize(*x, *camera, width, height, pair_capacity=rung(pairs))[:3]
+    draw = lambda *x: rasterize(*x, *camera, width, height, pair_capacity=next_capacity(pairs))[:3]
     weights = jax.tree.map(lambda x: jax.random.normal(jax.random.key(0), x.shape), jax.eval_shape(draw, *learned))
 
     def loss(*x):
@@ -233,16 +236,16 @@ def _stepper(count: int, width: int, height: int, margin: float = 1.1, moving: b
     pairs = [_pairs(one(moved, view), one(batch.cameras, view), width, height) for view in range(views)]
     shares = devices.shares(views)
     mesh = devices.mesh(views=shares)
-    capacity = rung(margin * np.reshape(pairs, (shares, -1)).sum(1).max())
+    capacity = next_capacity(margin * np.reshape(pairs, (shares, -1)).sum(1).max())
     alone = lambda tree: jax.tree.map(lambda x: x[None], tree)
-    states = devices.place(alone(jax.tree.map(jnp.array, state)), mesh, devices.MEMBERS)
-    batches = devices.place(alone(batch), mesh, devices.MEMBERS, devices.VIEWS)
+    states = devices.shard(alone(jax.tree.map(jnp.array, state)), mesh, devices.MEMBERS)
+    batches = devices.shard(alone(batch), mesh, devices.MEMBERS, devices.VIEWS)
     step = int(state.step)
 
     def take():
         nonlocal states, step
         states, report, _ = engine.train_steps(
-            states, batches, {}, step, config=CONFIG, moving=moving, pair_capacity=capacity, mesh=mesh
+            states, batches, {}, step, config=StaticConfig(CONFIG), moving=moving, pair_capacity=capacity, mesh=mesh
         )
         step += 1
         if report.overflow or not report.finite:
@@ -255,7 +258,7 @@ def _stepper(count: int, width: int, height: int, margin: float = 1.1, moving: b
 def _child(name: str, *arguments: str) -> str:
     """What a function of this module prints in a process of its own."""
     program = (
-        "import sys; from l2dgs_jax.devices import one_per_core; one_per_core(); "
+        "import sys; from l2dgs_jax.runtime.devices import one_per_core; one_per_core(); "
         f"from experiments.benchmarks import cases; cases._{name}(*sys.argv[1:])"
     )
     done = subprocess.run([sys.executable, "-c", program, *arguments], check=True, capture_output=True, text=True)

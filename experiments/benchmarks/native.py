@@ -9,8 +9,9 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from l2dgs_jax.projection import project
-from l2dgs_jax.rasterizer.intersect import TILE, footprints, grid, intersect, pairs_needed
+from l2dgs_jax.kernels.tiles import TILE, TileLists, grid
+from l2dgs_jax.rasterizer.projection import project
+from l2dgs_jax.rasterizer.tile_lists import footprints, intersect, pairs_needed
 
 FLAGS = ("-Ofast", "-march=native", "-mprefer-vector-width=512", "-fopenmp", "-shared", "-fPIC")
 
@@ -63,7 +64,7 @@ def _build(channels: int) -> ctypes.CDLL:
     return ctypes.CDLL(str(library))
 
 
-def _lists(arrays: dict[str, np.ndarray], width: int, height: int):
+def _lists(arrays: dict[str, np.ndarray], width: int, height: int) -> tuple[np.ndarray, np.ndarray, TileLists]:
     geometry = [arrays[name] for name in ("means", "quats", "scales", "viewmat", "K")]
     projected = jax.tree.map(lambda x: x[None], project(*map(jax.numpy.asarray, geometry), width=width, height=height))
     boxes = footprints(projected, jax.numpy.asarray(arrays["opacities"])[None], width, height)

@@ -1,6 +1,8 @@
-"""Measure, and compare with the committed baseline: `python -m experiments.benchmarks.run [CASE ...]`."""
+"""Measure, and compare with this machine's baseline: `python -m experiments.benchmarks.run [CASE ...] [--check]`."""
 
 import json
+import re
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -9,23 +11,28 @@ import tyro
 
 from experiments.benchmarks.cases import CASES
 from experiments.benchmarks.stopwatch import machine
-from l2dgs_jax import devices
-from l2dgs_jax.cli import use_huge_pages
+from l2dgs_jax.runtime import devices
+from l2dgs_jax.runtime.command_line import use_huge_pages
 
-BASELINE = Path(__file__).with_name("baseline.json")
+BASELINES = Path(__file__).with_name("baselines")
 TOLERANCE = 1.3  # machines are shared: a smaller ratio is noise
 
 
 @dataclass
 class Options:
-    """Measure speed and memory; run it on idle cores."""
+    """Measure speed and memory; run it on idle cores.
+
+    Attributes:
+        cases: which to run: rasterizer, growth, folding, parts, step, rendering, compiling, memory, scale.
+        json: where to write the figures.
+        check: exit with code 1 if a figure is worse than the baseline of this machine by more than the tolerance.
+        update: make them the baseline of this machine.
+    """
 
     cases: Annotated[tuple[str, ...], tyro.conf.Positional] = tuple(CASES)
-    """Which to run: rasterizer, growth, folding, parts, step, rendering, compiling, memory, scale."""
     json: Path | None = None
-    """Where to write the figures."""
+    check: bool = False
     update: bool = False
-    """Make them the baseline."""
 
 
 def main() -> None:
@@ -35,28 +42,47 @@ def main() -> None:
         raise SystemExit(f"error: no case {', '.join(sorted(unknown))}; expected some of {', '.join(CASES)}")
     use_huge_pages()
     devices.one_per_core()
-    baseline = json.loads(BASELINE.read_text()) if BASELINE.exists() else {"machine": {}, "figures": {}}
-    report = {"machine": machine(), "figures": {}}
-    print(json.dumps(report["machine"]))
-    if baseline["machine"] and baseline["machine"] != report["machine"]:
-        print(f"the baseline is of another machine: {json.dumps(baseline['machine'])}")
+    here = machine()
+    path = BASELINES / f"{slug(here)}.json"
+    if options.check and not path.exists():
+        raise SystemExit(f"error: {path} is missing; expected a baseline of this machine: make one with --update")
+    baseline = json.loads(path.read_text()) if path.exists() else {"machine": here, "figures": {}}
+    print(json.dumps(here))
+    if baseline["machine"] != here:
+        print(f"the baseline has other versions: {json.dumps(baseline['machine'])}")
+    report: dict = {"machine": here, "figures": {}}
+    worse = []
     for case in options.cases:
         figures = CASES[case]()
         report["figures"][case] = {name: round(value, 3) for name, value in figures.items()}
         for name, value in figures.items():
-            print(f"{case:12}{name:42}{value:12.3f}  {_verdict(value, baseline['figures'].get(case, {}).get(name))}")
+            factor = slowdown(name, value, baseline["figures"].get(case, {}).get(name))
+            verdict = "" if factor is None else f"{factor:5.2f} of the baseline"
+            if factor is not None and factor > TOLERANCE:
+                worse.append(f"{case} {name}")
+                verdict += "  <- worse"
+            print(f"{case:12}{name:42}{value:12.3f}  {verdict}", flush=True)
     if options.json:
         options.json.write_text(json.dumps(report, indent=2) + "\n")
     if options.update:
-        merged = {"machine": report["machine"], "figures": baseline["figures"] | report["figures"]}
-        BASELINE.write_text(json.dumps(merged, indent=2) + "\n")
+        merged = {"machine": here, "figures": baseline["figures"] | report["figures"]}
+        path.write_text(json.dumps(merged, indent=2) + "\n")
+    if options.check and worse:
+        print(f"worse than the baseline: {', '.join(worse)}", file=sys.stderr)
+        sys.exit(1)
 
 
-def _verdict(value: float, baseline: float | None) -> str:
-    if not baseline:
-        return ""
-    ratio = value / baseline
-    return f"{ratio:5.2f} of the baseline{'' if 1 / TOLERANCE < ratio < TOLERANCE else '  <- differs'}"
+def slug(machine: dict[str, str | int]) -> str:
+    """What the machine's baseline is called."""
+    name = f"{machine['processor']} {machine['cores']} cores"
+    return re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")
+
+
+def slowdown(name: str, value: float, baseline: float | None) -> float | None:
+    """How many times as much time or memory as the baseline; None where there is none to compare with."""
+    if not baseline or not value:
+        return None
+    return baseline / value if name.endswith("_per_s") else value / baseline
 
 
 if __name__ == "__main__":

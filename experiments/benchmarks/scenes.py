@@ -6,12 +6,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import logit
 
-from l2dgs_jax import engine
 from l2dgs_jax.config import Config
 from l2dgs_jax.data.dataset import Dataset, Split
 from l2dgs_jax.data.stacks import stacked
-from l2dgs_jax.scene import pad_rows
-from l2dgs_jax.step import Batch, TrainState, begin_stage
+from l2dgs_jax.model.initialisation import pad_rows
+from l2dgs_jax.training import engine, initial_state
+from l2dgs_jax.training.step import Batch, TrainState, begin_stage
 from l2dgs_jax.types import Camera
 
 
@@ -66,7 +66,7 @@ def video(count: int, width: int, height: int, frames: int, *, in_file: bool = F
 def fine_state(dataset: Dataset, config: Config) -> TrainState:
     """The start of the fine stage, with the `cloud` of a `video` as Gaussians."""
     arrays = cloud(len(dataset.points), dataset.width, dataset.height)
-    scene = engine.initial_state(dataset, config).scene
+    scene = initial_state(dataset, config).scene
     rows = partial(pad_rows, capacity=len(scene.alive))
     gaussians = scene.params.gaussians._replace(
         quats=rows(jnp.asarray(arrays["quats"])),

@@ -8,14 +8,16 @@ import numpy as np
 
 from l2dgs_jax.config import Config
 from l2dgs_jax.data import colmap, demo, llff, nerfies, splits, transforms
-from l2dgs_jax.data.dataset import Dataset
+from l2dgs_jax.data.dataset import Dataset, Split
 from l2dgs_jax.errors import UserError
+
+__all__ = ["LAYOUTS", "Dataset", "Split", "load_dataset"]
 
 # Each has recognizes(folder), read(folder, downscale, held_out, frame_memory) and write(dataset, folder).
 LAYOUTS: dict[str, ModuleType] = {"nerfies": nerfies, "colmap": colmap, "transforms": transforms, "llff": llff}
 
 
-def load(
+def load_dataset(
     scene: str | Path,
     downscale: int = 1,
     format: str = "auto",
@@ -28,8 +30,8 @@ def load(
         scene: its folder, or "demo" for the clip that comes with the package.
         downscale: whole factor by which images are smaller than full size.
         format: a name in `LAYOUTS`, or "auto" for the one that the folder has.
-        held_out: which frames are not trained on, see `splits.choose`.
-        frame_memory: GiB that its frames may take; if they take more they lie in temporary files (`FileStack`).
+        held_out: which frames are not trained on, see `splits.hold_out`.
+        frame_memory: GiB that its frames may take; if they take more they lie in temporary files (`MappedArray`).
 
     Raises:
         UserError: anything in the scene is missing, malformed or inconsistent.

@@ -16,13 +16,13 @@ from l2dgs_jax.data.lens import Lens, scale_intrinsics, seen, undistort, without
 from l2dgs_jax.data.pictures import Picture, stored_if_any
 from l2dgs_jax.data.stacks import stacked
 from l2dgs_jax.errors import UserError
-from l2dgs_jax.threads import in_order
+from l2dgs_jax.runtime.prefetch import prefetch
 from l2dgs_jax.types import Camera
 
 LINEAR_NOTE = "pictures of floating-point values are taken as linear light and converted to sRGB"
 
 # Decoding and resampling release the interpreter lock.
-_parallel = partial(in_order, workers=min(os.cpu_count() or 1, 8))
+_parallel = partial(prefetch, workers=min(os.cpu_count() or 1, 8))
 
 
 @dataclass(frozen=True)
@@ -91,8 +91,8 @@ def assemble(
     width, height = full[0] // downscale, full[1] // downscale
     kinds = 1 + (folder / "well").is_dir()  # masks take a sixth of what pictures take
     in_file = kinds * len(frames) * height * width * 3 * np.dtype(np.float16).itemsize > frame_memory * 2**30
-    learned, train_notes = _read_split(folder, "train", train, width, height, downscale, in_file)
-    held_out, test_notes = _read_split(folder, "val", test, width, height, downscale, in_file)
+    learned, train_notes = _SplitReader(folder, "train", train, width, height, downscale, in_file).read()
+    held_out, test_notes = _SplitReader(folder, "val", test, width, height, downscale, in_file).read()
     return Dataset(
         name=folder.resolve().name,
         width=width,
@@ -129,80 +129,112 @@ def _check_pictures(pictures: Sequence[Picture], full: tuple[int, int]) -> bool:
     return any(header.linear for header in headers)
 
 
-def _read_split(
-    folder: Path, part: str, frames: Sequence[Frame], width: int, height: int, downscale: int, in_file: bool
-) -> tuple[Split, list[str]]:
-    """Read the pictures of one split, with notes; truth and masks that no frame has are None."""
-    names = [frame.name for frame in frames]
-    notes: list[str] = []
+@dataclass(frozen=True)
+class _SplitReader:
+    """Reads what lies on disk of the frames of one split, undistorted and of one size.
 
-    def fit(frame: Frame, scale: int, image: Float32[np.ndarray, "h w C"]) -> Float32[np.ndarray, "H W C"]:
-        return shrink(undistort(image, scale_intrinsics(frame.K, scale), frame.lens), scale)
+    Attributes:
+        folder: of the scene.
+        part: "train" or "val".
+        frames: of the split.
+        width: of the images to return, pixels.
+        height: likewise.
+        downscale: factor on the full size.
+        in_file: whether stacks of frames go to temporary files.
+    """
 
-    def shrink(image: Float32[np.ndarray, "h w C"], scale: int) -> Float32[np.ndarray, "H W C"]:
-        return images.area_average(image, downscale // scale)[:height, :width]
+    folder: Path
+    part: str
+    frames: Sequence[Frame]
+    width: int
+    height: int
+    downscale: int
+    in_file: bool
 
-    def stack(values: Iterator[np.ndarray], dtype: type, *channels: int) -> np.ndarray:
-        return stacked(values, (len(frames), height, width, *channels), dtype, in_file)
+    def read(self) -> tuple[Split, list[str]]:
+        """The split, with notes; truth and masks that no frame has are None."""
+        lowlight, valid = self._lowlight()
+        welllit, well_note = self._truth("well", bool_mask=False)
+        masks, mask_note = self._truth("mask", bool_mask=True)
+        covisible, covisible_note = self._truth("covisible", bool_mask=True, prefix=f"{self.part}/")
+        K = [scale_intrinsics(without_skew(frame.K), self.downscale) for frame in self.frames]
+        split = Split(
+            names=tuple(frame.name for frame in self.frames),
+            cameras=Camera(
+                viewmat=_singles([frame.viewmat for frame in self.frames], self.frames),
+                K=_singles(K, self.frames),
+                time=_singles([np.array(frame.time) for frame in self.frames], self.frames),
+            ),
+            images=lowlight,
+            welllit=welllit,
+            masks=masks,
+            valid=valid,
+            covisible=covisible,
+            originals=tuple(Original(frame.size, frame.K, frame.lens) for frame in self.frames),
+        )
+        return split, [note for note in (well_note, mask_note, covisible_note) if note]
 
-    def read_all(root: Path, prefix: str = "", masks: bool = True) -> np.ndarray | None:
-        found, note = stored_if_any(root, downscale, [prefix + name for name in names], all_or_none=not masks)
-        if note:
-            notes.append(note)
-        if not found:
-            return None
-        _check_pictures(found, frames[0].size)
+    def _lowlight(self) -> tuple[Float16[np.ndarray, "F H W 3"], Bool[np.ndarray, "F H W"] | None]:
+        """The low-light images, and which of their pixels count; None if all do."""
+        # Few frames have pixels that do not count, and only theirs are kept, as bits, until all are known.
+        partly: dict[int, UInt8[np.ndarray, " B"]] = {}
 
-        def read(index: int) -> Float16[np.ndarray, "H W 3"] | Bool[np.ndarray, "H W"]:
-            picture = found[index]
-            image = fit(frames[index], picture.scale, images.read_image(picture.path)).astype(np.float16)
-            return image.mean(-1) > 0.5 if masks else image
+        def read_one(index: int) -> Float16[np.ndarray, "H W 3"]:
+            image, counts = self._read_frame(self.frames[index])
+            if not counts.all():
+                partly[index] = np.packbits(counts)
+            return image
 
-        return stack(_parallel(read, range(len(frames))), *((bool,) if masks else (np.float16, 3)))
+        lowlight = self._stack(_parallel(read_one, range(len(self.frames))), np.float16, 3)
+        if not partly:
+            return lowlight, None
+        size = self.height * self.width
+        every_bit = np.packbits(np.ones(size, bool))
+        bits = (partly.get(index, every_bit) for index in range(len(self.frames)))
+        masks = (np.unpackbits(b, count=size).reshape(self.height, self.width).astype(bool) for b in bits)
+        return lowlight, self._stack(masks, bool)
 
-    marked: dict[int, UInt8[np.ndarray, " B"]] = {}  # of the frames whose pixels do not all count, which do, as bits
-
-    def read_frame(index: int) -> Float16[np.ndarray, "H W 3"]:
-        frame = frames[index]
+    def _read_frame(self, frame: Frame) -> tuple[Float16[np.ndarray, "H W 3"], Bool[np.ndarray, "H W"]]:
+        """A low-light image, and which of its pixels count."""
         scale, alpha = frame.image.scale, None
         if frame.alpha == "coverage":
             image = images.read_over_black(frame.image.path)
         else:
             image, alpha = images.read_image_and_alpha(frame.image.path)
-        inside = seen((image.shape[1], image.shape[0]), scale_intrinsics(frame.K, scale), frame.lens)
+        counts = np.ones((self.height, self.width), bool)
         # A pixel counts if all that it was made from does.
-        counts = all_count
+        inside = seen((image.shape[1], image.shape[0]), scale_intrinsics(frame.K, scale), frame.lens)
         if inside is not None:
-            counts = shrink(inside[..., None].astype(np.float32), scale)[..., 0] > 0.999
+            counts = counts & (self._shrink(inside[..., None].astype(np.float32), scale)[..., 0] > 0.999)
         if alpha is not None:
-            counts = counts & (fit(frame, scale, (alpha > 0.5).astype(np.float32))[..., 0] > 0.999)
-        if not counts.all():
-            marked[index] = np.packbits(counts)
-        return fit(frame, scale, image).astype(np.float16)
+            counts = counts & (self._fit(frame, (alpha > 0.5).astype(np.float32), scale)[..., 0] > 0.999)
+        return self._fit(frame, image, scale).astype(np.float16), counts
 
-    def counting(index: int) -> Bool[np.ndarray, "H W"]:
-        bits = marked.get(index, every_bit)
-        return np.unpackbits(bits, count=height * width).reshape(height, width).astype(bool)
+    def _truth(self, kind: str, bool_mask: bool, prefix: str = "") -> tuple[Any, str]:
+        """What lies in a folder beside the layout's own, as images or as masks, and a note if it cannot be used."""
+        names = [prefix + frame.name for frame in self.frames]
+        found, note = stored_if_any(self.folder / kind, self.downscale, names, all_or_none=not bool_mask)
+        if not found:
+            return None, note
+        _check_pictures(found, self.frames[0].size)
 
-    all_count = np.ones((height, width), bool)
-    every_bit = np.packbits(all_count)
-    lowlight = stack(_parallel(read_frame, range(len(frames))), np.float16, 3)
-    K = [scale_intrinsics(without_skew(frame.K), downscale) for frame in frames]
-    split = Split(
-        names=tuple(names),
-        cameras=Camera(
-            viewmat=_singles([frame.viewmat for frame in frames], frames),
-            K=_singles(K, frames),
-            time=_singles([np.array(frame.time) for frame in frames], frames),
-        ),
-        images=lowlight,
-        welllit=read_all(folder / "well", masks=False),
-        masks=read_all(folder / "mask"),
-        valid=stack(map(counting, range(len(frames))), bool) if marked else None,
-        covisible=read_all(folder / "covisible", f"{part}/"),
-        originals=tuple(Original(frame.size, frame.K, frame.lens) for frame in frames),
-    )
-    return split, notes
+        def read_one(index: int) -> Float16[np.ndarray, "H W 3"] | Bool[np.ndarray, "H W"]:
+            picture = found[index]
+            image = self._fit(self.frames[index], images.read_image(picture.path), picture.scale).astype(np.float16)
+            return image.mean(-1) > 0.5 if bool_mask else image
+
+        read_all = _parallel(read_one, range(len(self.frames)))
+        return self._stack(read_all, bool) if bool_mask else self._stack(read_all, np.float16, 3), note
+
+    def _fit(self, frame: Frame, image: Float32[np.ndarray, "h w C"], scale: int) -> Float32[np.ndarray, "H W C"]:
+        """A picture that is already `scale` times smaller, undistorted, at the size wanted."""
+        return self._shrink(undistort(image, scale_intrinsics(frame.K, scale), frame.lens), scale)
+
+    def _shrink(self, image: Float32[np.ndarray, "h w C"], scale: int) -> Float32[np.ndarray, "H W C"]:
+        return images.area_average(image, self.downscale // scale)[: self.height, : self.width]
+
+    def _stack(self, values: Iterator[np.ndarray], dtype: type, *channels: int) -> np.ndarray:
+        return stacked(values, (len(self.frames), self.height, self.width, *channels), dtype, self.in_file)
 
 
 def _singles(values: Sequence[np.ndarray], frames: Sequence[Frame]) -> Any:

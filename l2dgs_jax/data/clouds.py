@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Float32, Float64, Shaped
 
+from l2dgs_jax.cameras.geometry import camera_centres
 from l2dgs_jax.errors import UserError
 
 COUNT = 10_000  # points of a random cloud
@@ -21,7 +22,7 @@ _TYPES |= {"float32": "f4", "float64": "f8"}
 _ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 
-def beside(folder: Path, named: str | None = None) -> Cloud | None:
+def find(folder: Path, named: str | None = None) -> Cloud | None:
     """The cloud in a PLY file of the scene: the one it names, else one of `FILES`.
 
     Raises:
@@ -39,7 +40,7 @@ def in_common_box(viewmats: Float64[np.ndarray, "F 4 4"], source: str) -> Float6
     Raises:
         UserError: they look at no common place.
     """
-    centres = np.linalg.inv(viewmats)[:, :3, 3]
+    centres = camera_centres(viewmats)
     axes = viewmats[:, 2, :3]
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # onto the plane that an axis is normal to
     total = across.sum(0)

@@ -20,7 +20,7 @@ from l2dgs_jax.data.lens import Lens
 from l2dgs_jax.data.pictures import by_name, copies
 from l2dgs_jax.data.writing import write_lists, write_pictures
 from l2dgs_jax.errors import UserError
-from l2dgs_jax.files import new_folder
+from l2dgs_jax.runtime.files import new_folder
 
 
 def recognizes(folder: Path) -> bool:
@@ -34,23 +34,23 @@ def read(folder: Path, downscale: int, held_out: str, frame_memory: float) -> Da
     Args:
         folder: of the scene.
         downscale: factor on the full size of the images.
-        held_out: see `splits.choose`; without lists every eighth frame is held out.
+        held_out: see `splits.hold_out`; without lists every eighth frame is held out.
         frame_memory: see `assemble`.
 
     Raises:
         UserError: a file is missing, malformed or inconsistent.
     """
-    place = colmap_model.find(folder)
-    if place is None:
+    model = colmap_model.find(folder)
+    if model is None:
         raise UserError(f"{folder / 'sparse' / '0'}: no such model; expected COLMAP's cameras, images and points3D")
-    cameras, images = colmap_model.read_cameras(place), colmap_model.read_images(place)
-    points, colors = colmap_model.read_points(place)
+    cameras, images = colmap_model.read_cameras(model), colmap_model.read_images(model)
+    points, colors = colmap_model.read_points(model)
 
     by_stem = {Path(image.name).with_suffix("").as_posix() if image.name else "": image for image in images}
     if len(by_stem) < len(images):
-        raise UserError(f"{place}: images of one name but different suffixes; expected names that differ before it")
+        raise UserError(f"{model}: images of one name but different suffixes; expected names that differ before it")
     names = list(by_stem)
-    train, test, notes = splits.choose(str(place), names, splits.lists_beside(folder, names), held_out, default="8")
+    train, test, notes = splits.hold_out(str(model), names, splits.lists_beside(folder, names), held_out, default="8")
     times = splits.instants(folder, names)
     root = _root(folder, names)
 
@@ -60,18 +60,18 @@ def read(folder: Path, downscale: int, held_out: str, frame_memory: float) -> Da
         for name, picture in zip(chosen, pictures, strict=True):
             image = by_stem[name]
             if image.camera not in cameras:
-                raise UserError(f"{place}: '{image.name}' has camera {image.camera}; expected one that the model lists")
+                raise UserError(f"{model}: '{image.name}' has camera {image.camera}; expected one that the model lists")
             camera = cameras[image.camera]
             K, lens = pinhole_and_lens(camera)
             if not (K[0, 0] > 0 and K[1, 1] > 0):
-                raise UserError(f"{place}: camera {image.camera} has no positive focal length; expected one")
-            source, size = f"{place}, camera {image.camera}", (camera.width, camera.height)
+                raise UserError(f"{model}: camera {image.camera} has no positive focal length; expected one")
+            source, size = f"{model}, camera {image.camera}", (camera.width, camera.height)
             described.append(Frame(name, source, image.viewmat, K, lens, size, times[name], picture))
         return described
 
-    others = sorted(path.name for path in (folder / "sparse").iterdir() if path.is_dir() and path != place)
+    others = sorted(path.name for path in (folder / "sparse").iterdir() if path.is_dir() and path != model)
     if others:
-        notes = (*notes, f"{place} is used; sparse/ also holds the models {', '.join(others)}")
+        notes = (*notes, f"{model} is used; sparse/ also holds the models {', '.join(others)}")
     return assemble(folder, frames(train), frames(test), points, colors, downscale, frame_memory, notes)
 
 
@@ -89,10 +89,10 @@ def write(dataset: Dataset, folder: Path) -> None:
             camera = ModelCamera("PINHOLE", dataset.width, dataset.height, params)
             number = cameras.setdefault(camera, len(cameras) + 1)
             images.append(ModelImage(f"{name}.png", np.asarray(viewmat, np.float64), number))
-    with new_folder(folder) as place:
-        write_pictures(dataset, place / "images", place)
-        write_lists(dataset, place)
-        colmap_model.write_model(place / "sparse" / "0", list(cameras), images, dataset.points, dataset.colors)
+    with new_folder(folder) as target:
+        write_pictures(dataset, target / "images", target)
+        write_lists(dataset, target)
+        colmap_model.write_model(target / "sparse" / "0", list(cameras), images, dataset.points, dataset.colors)
 
 
 def pinhole_and_lens(camera: ModelCamera) -> tuple[Float64[np.ndarray, "3 3"], Lens]:
@@ -113,9 +113,9 @@ def pinhole_and_lens(camera: ModelCamera) -> tuple[Float64[np.ndarray, "3 3"], L
 def _root(folder: Path, names: list[str]) -> Path:
     """The folder that the images' names are relative to: `images` or another that holds the first one."""
     usual = folder / "images"
-    for place in (usual, folder, *sorted(path for path in folder.iterdir() if path.is_dir())):
-        if place.is_dir() and names[0] in by_name(place):
-            return place
+    for candidate in (usual, folder, *sorted(path for path in folder.iterdir() if path.is_dir())):
+        if candidate.is_dir() and names[0] in by_name(candidate):
+            return candidate
     if not usual.is_dir():
         raise UserError(f"{usual}: no such folder; expected the pictures that the model was made from")
     return usual

@@ -52,9 +52,9 @@ class ModelImage(NamedTuple):
 
 def find(folder: Path) -> Path | None:
     """The folder of the scene's model, `sparse/0` or `sparse`, if it has one."""
-    for place in (folder / "sparse" / "0", folder / "sparse"):
-        if any((place / f"images{suffix}").is_file() for suffix in (".bin", ".txt")):
-            return place
+    for candidate in (folder / "sparse" / "0", folder / "sparse"):
+        if any((candidate / f"images{suffix}").is_file() for suffix in (".bin", ".txt")):
+            return candidate
     return None
 
 

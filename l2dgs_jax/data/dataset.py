@@ -1,12 +1,15 @@
 """The one type that every reader returns."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
 
+from l2dgs_jax.cameras.geometry import select_camera
 from l2dgs_jax.data.lens import Lens
+from l2dgs_jax.data.stacks import pixel_mean
 from l2dgs_jax.types import Camera
 
 
@@ -26,7 +29,7 @@ class Original(NamedTuple):
 
 @dataclass(frozen=True)
 class Split:
-    """Frames of a scene as NumPy arrays; images, truth and masks beyond a budget of memory are `FileStack`s.
+    """Frames of a scene as NumPy arrays; images, truth and masks beyond a budget of memory are `MappedArray`s.
 
     Attributes:
         names: of the frames.
@@ -47,6 +50,15 @@ class Split:
     valid: Bool[np.ndarray, "F H W"] | None = None
     covisible: Bool[np.ndarray, "F H W"] | None = None
     originals: tuple[Original, ...] = ()
+
+    @cached_property
+    def mean_level(self) -> float:
+        """Mean sRGB value of all pixels that count."""
+        return float(np.mean(pixel_mean(self.images, self.valid)))
+
+    def camera(self, index: int) -> Camera:
+        """The camera of one frame."""
+        return select_camera(self.cameras, index)
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,9 @@ import numpy as np
 import OpenImageIO as oiio  # noqa: N813
 from jaxtyping import Bool, Float, Float32, Shaped, UInt8
 
+from l2dgs_jax.data.color import linear_to_srgb
 from l2dgs_jax.errors import UserError
-from l2dgs_jax.files import replacing
-from l2dgs_jax.tone import linear_to_srgb
+from l2dgs_jax.runtime.files import replacing
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".exr", ".hdr", ".bmp")
 

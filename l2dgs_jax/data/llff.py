@@ -2,7 +2,7 @@
 
     poses_bounds.npy   [F, 17]: pose [3, 5] (axes down, right, back; position; height, width, focal length), near, far
     images/<name>, in the order of their names   [images_<k>/<name>, k times smaller]
-    [a point cloud, see `clouds.beside`, else sparse/ as COLMAP has it]
+    [a point cloud, see `clouds.find`, else sparse/ as COLMAP has it]
     [dataset.json]   [metadata.json]   as Nerfies has them
 
 Alpha 0 marks pixels that do not count.
@@ -21,7 +21,7 @@ from l2dgs_jax.data.parsing import read_array, rotation
 from l2dgs_jax.data.pictures import by_name, copies
 from l2dgs_jax.data.writing import write_lists, write_pictures
 from l2dgs_jax.errors import UserError
-from l2dgs_jax.files import new_folder
+from l2dgs_jax.runtime.files import new_folder
 
 FILE = "poses_bounds.npy"
 _AXES = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1]])  # (down, right, back) from (right, down, forward), and back
@@ -38,7 +38,7 @@ def read(folder: Path, downscale: int, held_out: str, frame_memory: float) -> Da
     Args:
         folder: of the scene.
         downscale: factor on the full size of the images.
-        held_out: see `splits.choose`; without lists every eighth frame is held out.
+        held_out: see `splits.hold_out`; without lists every eighth frame is held out.
         frame_memory: see `assemble`.
 
     Raises:
@@ -53,7 +53,7 @@ def read(folder: Path, downscale: int, held_out: str, frame_memory: float) -> Da
     names = sorted(by_name(root))
     if len(names) != len(rows):
         raise UserError(f"{path}: has {len(rows)} poses for the {len(names)} pictures in {root}; expected one each")
-    train, test, notes = splits.choose(str(path), names, splits.lists_beside(folder, names), held_out, default="8")
+    train, test, notes = splits.hold_out(str(path), names, splits.lists_beside(folder, names), held_out, default="8")
     times = splits.instants(folder, names)
     described = {name: _camera(f"{path}, row {i}", row) for i, (name, row) in enumerate(zip(names, rows, strict=True))}
 
@@ -65,7 +65,7 @@ def read(folder: Path, downscale: int, held_out: str, frame_memory: float) -> Da
             )
         ]
 
-    model, cloud = colmap_model.find(folder), clouds.beside(folder)
+    model, cloud = colmap_model.find(folder), clouds.find(folder)
     if cloud is None and model:
         cloud = colmap_model.read_points(model)  # in the same world, as the poses come from it
     if cloud is None:
@@ -94,11 +94,11 @@ def write(dataset: Dataset, folder: Path) -> None:
             last = np.array([[dataset.height], [dataset.width], [K[0, 0]]])
             pose = np.concatenate([world[:3, :3] @ _AXES, world[:3, 3:], last], -1)
             rows[name] = np.concatenate([pose.ravel(), bounds])
-    with new_folder(folder) as place:
-        write_pictures(dataset, place / "images", place)
-        write_lists(dataset, place)
-        np.save(place / FILE, np.stack([rows[name] for name in sorted(rows)]))
-        clouds.write_ply(place / clouds.FILES[0], dataset.points, dataset.colors)
+    with new_folder(folder) as target:
+        write_pictures(dataset, target / "images", target)
+        write_lists(dataset, target)
+        np.save(target / FILE, np.stack([rows[name] for name in sorted(rows)]))
+        clouds.write_ply(target / clouds.FILES[0], dataset.points, dataset.colors)
 
 
 def _camera(

@@ -19,9 +19,9 @@ from l2dgs_jax.data.dataset import Dataset
 from l2dgs_jax.data.lens import Lens
 from l2dgs_jax.data.parsing import numbers, read_array, read_json, rotation
 from l2dgs_jax.data.pictures import Picture, stored
-from l2dgs_jax.data.writing import write_json, write_lists, write_pictures
+from l2dgs_jax.data.writing import write_lists, write_pictures
 from l2dgs_jax.errors import UserError
-from l2dgs_jax.files import new_folder
+from l2dgs_jax.runtime.files import new_folder, write_json
 
 
 def recognizes(folder: Path) -> bool:
@@ -35,14 +35,14 @@ def read(folder: Path, downscale: int, held_out: str, frame_memory: float) -> Da
     Args:
         folder: of the scene.
         downscale: factor on the full size of the images.
-        held_out: see `splits.choose`.
+        held_out: see `splits.hold_out`.
         frame_memory: see `assemble`.
 
     Raises:
         UserError: a file is missing, malformed or inconsistent.
     """
     listed, own = splits.lists(folder)
-    train, val, notes = splits.choose(f"{folder / 'dataset.json'}", listed, own, held_out, default="4dgs")
+    train, val, notes = splits.hold_out(f"{folder / 'dataset.json'}", listed, own, held_out, default="4dgs")
     times = splits.instants(folder, listed)
     center, scale = _normalization(folder)
     points, colors = _points(folder)
@@ -136,17 +136,17 @@ def write(dataset: Dataset, folder: Path) -> None:
     Raises:
         UserError: the folder holds files already or cannot be written.
     """
-    with new_folder(folder) as place:
-        write_pictures(dataset, place / "rgb" / "1x", place)
-        write_lists(dataset, place)
-        write_json(place / "scene.json", {"center": [0.0, 0.0, 0.0], "scale": 1.0})
-        np.save(place / "points.npy", dataset.points)
+    with new_folder(folder) as target:
+        write_pictures(dataset, target / "rgb" / "1x", target)
+        write_lists(dataset, target)
+        write_json(target / "scene.json", {"center": [0.0, 0.0, 0.0], "scale": 1.0})
+        np.save(target / "points.npy", dataset.points)
         if dataset.colors is not None:
-            np.save(place / "points_rgb.npy", dataset.colors)
+            np.save(target / "points_rgb.npy", dataset.colors)
         for split in (dataset.train, dataset.test):
             for name, viewmat, K in zip(split.names, split.cameras.viewmat, split.cameras.K, strict=True):
                 write_json(
-                    place / "camera" / f"{name}.json",
+                    target / "camera" / f"{name}.json",
                     _camera(np.asarray(viewmat, np.float64), np.asarray(K, np.float64))
                     | {"image_size": [dataset.width, dataset.height]},
                 )

@@ -17,7 +17,7 @@ _DIGITS = re.compile(r"[0-9]+")
 
 
 def check_rule(rule: str) -> None:
-    """Complain if `choose` does not know the rule.
+    """Complain if `hold_out` does not know the rule.
 
     Raises:
         UserError: it does not.
@@ -26,7 +26,7 @@ def check_rule(rule: str) -> None:
         raise UserError(f"--held-out {rule}: expected auto, 4dgs, or a whole number k from 2 for every k-th frame")
 
 
-def choose(
+def hold_out(
     source: str, names: Sequence[str], own: Lists, rule: str, default: str
 ) -> tuple[list[str], list[str], tuple[str, ...]]:
     """Names to train on and names held out, and a note if the rule leaves frames out of both.

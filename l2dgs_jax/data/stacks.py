@@ -14,7 +14,7 @@ from numpy.typing import DTypeLike
 from l2dgs_jax.errors import UserError
 
 
-class FileStack(np.ndarray):
+class MappedArray(np.ndarray):
     """A read-only array over a mapped file: what is taken from it by index, or frame by frame, is a copy.
 
     The pages that were read are given back at once, to the system's cache of files: of the whole stack, no more than
@@ -37,7 +37,7 @@ def stacked(
         frames: as many as the first number of `shape`, each of the shape that the others give.
         shape: of the stack.
         dtype: of the stack.
-        in_file: return a `FileStack`. Its file has no name, in the folder for temporary files that TMPDIR names, and
+        in_file: return a `MappedArray`. Its file has no name, in the folder for temporary files that TMPDIR names, and
             is gone with the last use of the array, however the process ends.
 
     Raises:
@@ -46,8 +46,8 @@ def stacked(
     size = math.prod(shape) * np.dtype(dtype).itemsize
     if not in_file or not size:
         stack = np.empty(shape, dtype)
-        for place, frame in zip(range(len(stack)), frames, strict=True):
-            stack[place] = frame
+        for index, frame in zip(range(len(stack)), frames, strict=True):
+            stack[index] = frame
         return stack
     try:
         with tempfile.TemporaryFile() as file:
@@ -56,7 +56,7 @@ def stacked(
             for _, frame in zip(range(shape[0]), frames, strict=True):
                 file.write(np.ascontiguousarray(frame, dtype).data)
             file.flush()
-            return FileStack(shape, dtype, mmap.mmap(file.fileno(), size, access=mmap.ACCESS_READ))
+            return MappedArray(shape, dtype, mmap.mmap(file.fileno(), size, access=mmap.ACCESS_READ))
     except OSError as error:
         raise UserError(
             f"{tempfile.tempdir or 'TMPDIR'}: cannot hold {size / 2**30:.2g} GiB of frames ({error.strerror}); "

@@ -2,7 +2,7 @@
 
     transforms.json, or transforms_{train,test,val}.json     frames, cameras (axes right, up, back) and instants
     the pictures that they name   [images_<k>/<name> beside images/<name>, k times smaller]
-    [a point cloud, see `clouds.beside`]   [dataset.json]   [metadata.json]   as Nerfies has them
+    [a point cloud, see `clouds.find`]   [dataset.json]   [metadata.json]   as Nerfies has them
 
 Alpha says how much of a pixel the scene covers: pictures are composited over black, which is what a scene renders where
 nothing is.
@@ -23,9 +23,9 @@ from l2dgs_jax.data.lens import Lens
 from l2dgs_jax.data.parsing import name_list, numbers, read_json, rotation, value
 from l2dgs_jax.data.pictures import Picture, copies
 from l2dgs_jax.data.splits import NO_LISTS, Lists
-from l2dgs_jax.data.writing import write_json, write_pictures
+from l2dgs_jax.data.writing import write_pictures
 from l2dgs_jax.errors import UserError
-from l2dgs_jax.files import new_folder
+from l2dgs_jax.runtime.files import new_folder, write_json
 
 Entry = tuple[Path, dict[str, Any], Path]  # the file that lists a frame, what it says of it, and the frame's picture
 
@@ -45,7 +45,7 @@ def read(folder: Path, downscale: int, held_out: str, frame_memory: float) -> Da
     Args:
         folder: of the scene.
         downscale: factor on the full size of the images.
-        held_out: see `splits.choose`; without lists every eighth frame is held out.
+        held_out: see `splits.hold_out`; without lists every eighth frame is held out.
         frame_memory: see `assemble`.
 
     Raises:
@@ -54,12 +54,12 @@ def read(folder: Path, downscale: int, held_out: str, frame_memory: float) -> Da
     entries, own, ply = _entries(folder)
     names = list(entries)
     own = own if own[1] else splits.lists_beside(folder, names)
-    train, test, notes = splits.choose(str(folder), names, own, held_out, default="8")
+    train, test, notes = splits.hold_out(str(folder), names, own, held_out, default="8")
     times = _times(folder, entries)
     pictures = _pictures(folder, {name: entries[name][2] for name in [*train, *test]}, downscale)
     frames = {name: _frame(name, *entries[name], times[name], picture) for name, picture in pictures.items()}
 
-    cloud = clouds.beside(folder, ply)  # not from sparse/: programs move and scale the world that COLMAP found
+    cloud = clouds.find(folder, ply)  # not from sparse/: programs move and scale the world that COLMAP found
     if cloud is None:
         cloud = clouds.in_common_box(np.stack([frame.viewmat for frame in frames.values()]), str(folder)), None
         stand_in = f"{clouds.COUNT} random points where its cameras look stand in for one"
@@ -97,10 +97,10 @@ def write(dataset: Dataset, folder: Path) -> None:
         "test_filenames": files["val"],
         "frames": sorted(frames, key=lambda frame: frame["file_path"]),
     }
-    with new_folder(folder) as place:
-        write_pictures(dataset, place / "images", place)
-        write_json(place / "transforms.json", content)
-        clouds.write_ply(place / clouds.FILES[0], dataset.points, dataset.colors)
+    with new_folder(folder) as target:
+        write_pictures(dataset, target / "images", target)
+        write_json(target / "transforms.json", content)
+        clouds.write_ply(target / clouds.FILES[0], dataset.points, dataset.colors)
 
 
 def _entries(folder: Path) -> tuple[dict[str, Entry], Lists, str | None]:

@@ -1,6 +1,5 @@
 """What the writers of all layouts share: pictures, truth and masks, lists of frames and instants."""
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +9,7 @@ from jaxtyping import Shaped
 from l2dgs_jax.data.dataset import Dataset
 from l2dgs_jax.data.images import to_bytes, write_image
 from l2dgs_jax.errors import UserError
+from l2dgs_jax.runtime.files import write_json
 
 
 def write_pictures(dataset: Dataset, root: Path, folder: Path) -> None:
@@ -34,9 +34,9 @@ def write_pictures(dataset: Dataset, root: Path, folder: Path) -> None:
             if split.valid is not None:
                 pixels = np.dstack([pixels, to_bytes(split.valid[i])])
             _write(root / f"{name}.png", pixels)
-            for place, values in kinds:
+            for kind, values in kinds:
                 if values is not None:
-                    _write(place / f"{name}.png", to_bytes(values[i]))
+                    _write(kind / f"{name}.png", to_bytes(values[i]))
 
 
 def write_lists(dataset: Dataset, folder: Path) -> None:
@@ -52,12 +52,6 @@ def write_lists(dataset: Dataset, folder: Path) -> None:
     write_json(
         folder / "metadata.json", {name: {"warp_id": instants[time], "time": time} for name, time in times.items()}
     )
-
-
-def write_json(path: Path, content: object) -> None:
-    """Write a JSON file, making its folder."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(content, indent=2) + "\n")
 
 
 def _write(path: Path, pixels: Shaped[np.ndarray, "H W *C"]) -> None:

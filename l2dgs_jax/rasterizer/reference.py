@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from l2dgs_jax.projection import project
+from l2dgs_jax.rasterizer.projection import project
 
 
 def rasterize_dense(

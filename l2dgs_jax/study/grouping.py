@@ -4,16 +4,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from l2dgs_jax import engine, overrides
-from l2dgs_jax.config import Config
-from l2dgs_jax.data import load
+from l2dgs_jax.config import Config, overrides
+from l2dgs_jax.data import load_dataset
 from l2dgs_jax.data.dataset import Dataset
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.study.spec import Plan, Spec
+from l2dgs_jax.training import resolve
 
 
 @dataclass(frozen=True)
-class Entrant:
+class Trial:
     """A member of a study with its data loaded and its settings resolved."""
 
     plan: Plan
@@ -21,7 +21,7 @@ class Entrant:
     config: Config
 
 
-def enter(spec: Spec) -> list[list[Entrant]]:
+def load_groups(spec: Spec) -> list[list[Trial]]:
     """Load every scene once and put those members together that one program can train.
 
     Members of a group have images of one size, planes of one size, and settings that differ in nothing but the
@@ -31,22 +31,22 @@ def enter(spec: Spec) -> list[list[Entrant]]:
         UserError: a scene cannot be read, or the study insists on one program and there cannot be one.
     """
     datasets: dict[tuple, Dataset] = {}
-    groups: dict[tuple, list[Entrant]] = {}
+    groups: dict[tuple, list[Trial]] = {}
     for plan in spec.plans:
         c = plan.config
         source = (plan.scene, c.downscale, c.format, c.held_out, c.frame_memory)
         if source not in datasets:
-            datasets[source] = load(*source)
+            datasets[source] = load_dataset(*source)
         dataset = datasets[source]
-        entrant = Entrant(plan, dataset, engine.resolve(c, dataset.train))
-        groups.setdefault((overrides.outline(entrant.config), *_shapes(entrant).values()), []).append(entrant)
+        trial = Trial(plan, dataset, resolve(c, dataset.train))
+        groups.setdefault((overrides.outline(trial.config), *_shapes(trial).values()), []).append(trial)
     if spec.one_program and len(groups) > 1:
         raise UserError(_difference(list(groups.values())))
     return list(groups.values())
 
 
-def _shapes(entrant: Entrant) -> dict[str, object]:
-    dataset, config = entrant.dataset, entrant.config
+def _shapes(trial: Trial) -> dict[str, object]:
+    dataset, config = trial.dataset, trial.config
     return {
         "image size": f"{dataset.width}x{dataset.height}",
         "number of training frames": len(dataset.train.names) if config.model.time_size is None else None,
@@ -54,7 +54,7 @@ def _shapes(entrant: Entrant) -> dict[str, object]:
     }
 
 
-def _difference(groups: Sequence[Sequence[Entrant]]) -> str:
+def _difference(groups: Sequence[Sequence[Trial]]) -> str:
     """Why the first members of the first two groups cannot be trained together."""
     a, b = groups[0][0], groups[1][0]
     shapes = [(name, x, _shapes(b)[name]) for name, x in _shapes(a).items() if x != _shapes(b)[name]]

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from l2dgs_jax import runs
-from l2dgs_jax.files import replacing, write_json
+from l2dgs_jax.runtime.files import replacing, write_json
 
 JSON, MARKDOWN, PLOTS = "results.json", "results.md", "results.png"
 RESULT = "result.json"  # in the folder of a member

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from l2dgs_jax import overrides
-from l2dgs_jax.config import PRESETS, Config
+from l2dgs_jax.config import PRESETS, Config, overrides
 from l2dgs_jax.errors import UserError
 
 KEYS = ("scenes", "seeds", "preset", "settings", "grid", "variants", "one_program")
@@ -82,7 +81,7 @@ def _read_toml(path: Path) -> dict[str, Any]:
     except OSError as error:
         raise UserError(f"{path}: cannot be read ({error.strerror}); expected a TOML file") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise UserError(f"{path}: is no TOML ({error}); expected a file like the one in the README") from None
+        raise UserError(f"{path}: is no TOML ({error}); expected a file like the one in docs/studies.md") from None
 
 
 def _list(path: Path, content: dict[str, Any], key: str, kind: type) -> list:

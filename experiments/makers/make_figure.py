@@ -1,0 +1,39 @@
+"""The README's picture of a run: `python -m experiments.makers.make_figure RUN OUTPUT.png [--views N]`.
+
+One row a held-out view: the dark input, our estimate of it, the well-lit scene.
+"""
+
+import argparse
+from pathlib import Path
+
+import cv2
+import jax
+import numpy as np
+
+from l2dgs_jax import open_run
+from l2dgs_jax.cameras.geometry import select_camera
+from l2dgs_jax.data.images import to_bytes, write_image
+
+GAP = 6  # pixels
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("run", type=Path)
+    parser.add_argument("output", type=Path)
+    parser.add_argument("--views", type=int, default=2)
+    options = parser.parse_args()
+
+    run = open_run(options.run)
+    split, renderer = run.dataset.test, run.renderer()
+    rows = []
+    for i in np.linspace(0, len(split.names) - 1, options.views + 2).round().astype(int)[1:-1]:
+        images = jax.device_get(renderer(select_camera(split.cameras, int(i)))).images
+        pictures = [to_bytes(x) for x in (split.images[i], images.lowlight, images.welllit)]
+        rows.append(np.hstack([np.pad(p, ((0, GAP), (0, GAP), (0, 0)), constant_values=255) for p in pictures]))
+    figure = np.vstack(rows)[:-GAP, :-GAP]
+    write_image(options.output, cv2.resize(figure, None, fx=1.25, fy=1.25, interpolation=cv2.INTER_CUBIC))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""How good poses, masks and results are, against what is known."""

@@ -1,0 +1,33 @@
+"""`l2dgs COMMAND ...`, or `python -m l2dgs_jax COMMAND ...`: the same as `python -m l2dgs_jax.COMMAND ...`."""
+
+import runpy
+import sys
+
+COMMANDS = {
+    "train": "train a scene from a dark video with poses",
+    "evaluate": "score a run's held-out views",
+    "render": "a run's views as images",
+    "sweep": "train a study of scenes, seeds and settings",
+    "prepare": "poses and points for a video of one's own",
+    "convert": "a scene in another program's layout",
+    "masks": "masks of what moves in a scene",
+    "simulate": "a low-light twin of a well-lit scene",
+}
+
+
+def main() -> None:
+    """Run the command that the first argument names."""
+    command, *arguments = sys.argv[1:] or ["--help"]
+    if command in ("-h", "--help"):
+        lines = [f"  {name:10}{what}" for name, what in COMMANDS.items()]
+        print("\n".join(["usage: l2dgs COMMAND ...   (l2dgs COMMAND --help says more)", "", *lines]))
+    elif command in COMMANDS:
+        sys.argv = [f"l2dgs {command}", *arguments]
+        runpy.run_module(f"l2dgs_jax.{command}", run_name="__main__", alter_sys=False)
+    else:
+        print(f"error: {command}: no such command; expected one of {', '.join(COMMANDS)}", file=sys.stderr)
+        sys.exit(2)
+
+
+if __name__ == "__main__":
+    main()

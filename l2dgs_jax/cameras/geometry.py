@@ -1,0 +1,35 @@
+"""Where cameras are, how far they spread, one camera out of many, and cameras of other image sizes."""
+
+from typing import TypeVar
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from l2dgs_jax.types import Camera
+
+AnyArray = TypeVar("AnyArray", Array, np.ndarray)
+
+
+def camera_centres(viewmats: AnyArray) -> AnyArray:
+    """Centres [*B 3] of cameras in world units, of rigid `viewmats` [*B 4 4]; carries gradients."""
+    # Sums of products and not a matrix product, which accelerators round to few digits.
+    return -(viewmats[..., :3, :3] * viewmats[..., :3, 3:]).sum(-2)
+
+
+def camera_extent(cameras: Camera) -> float:
+    """1.1 times the largest distance of a camera centre from their mean, world units (as 3DGS and 4DGS)."""
+    centres = camera_centres(np.asarray(cameras.viewmat, np.float64))
+    return float(1.1 * np.linalg.norm(centres - centres.mean(0), axis=-1).max())
+
+
+def select_camera(cameras: Camera, index: int) -> Camera:
+    """One camera of a batch."""
+    return Camera(*(x[index] for x in cameras))
+
+
+def resize(camera: Camera, factor: float) -> Camera:
+    """The same view in an image `factor` times as wide and as high; exact, because pixel centres lie at +0.5."""
+    scale: Float[np.ndarray, "3 1"] = np.array([[factor], [factor], [1.0]])
+    K = jnp.asarray(camera.K)
+    return camera._replace(K=K * jnp.asarray(scale, K.dtype).reshape(*[1] * (K.ndim - 2), 3, 1))

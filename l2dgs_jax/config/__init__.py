@@ -1,0 +1,29 @@
+"""Every setting, the named presets, and settings by their dotted names."""
+
+from l2dgs_jax.config.presets import PRESETS
+from l2dgs_jax.config.settings import (
+    EXECUTION,
+    Config,
+    DensityConfig,
+    Layout,
+    LayoutName,
+    LossConfig,
+    ModelConfig,
+    OptimConfig,
+    from_dict,
+    to_dict,
+)
+
+__all__ = [
+    "EXECUTION",
+    "PRESETS",
+    "Config",
+    "DensityConfig",
+    "Layout",
+    "LayoutName",
+    "LossConfig",
+    "ModelConfig",
+    "OptimConfig",
+    "from_dict",
+    "to_dict",
+]

@@ -1,0 +1,198 @@
+"""Every setting, as frozen dataclasses; the defaults are the paper's, where it gives any."""
+
+import ast
+import dataclasses
+import json
+import math
+from dataclasses import dataclass, field
+from typing import Annotated, Any, Literal
+
+import tyro
+from jaxtyping import Array, Float, Int
+
+from l2dgs_jax.errors import UserError
+
+LayoutName = Literal["nerfies", "colmap", "transforms", "llff"]
+Layout = Literal["auto"] | LayoutName
+
+# Settings that a compiled step may take as arguments are numbers outside of it and traced scalars inside
+# (`overrides.combine`); the command line reads the plain kinds.
+_Float = float | Float[Array, ""]
+_Int = int | Int[Array, ""]
+
+
+def _arg(kind: Any) -> Any:
+    return tyro.conf.arg(
+        constructor=kind, help_behavior_hint=lambda shown: f"(default: {' '.join(map(str, ast.literal_eval(shown)))})"
+    )
+
+
+_PLAIN_NUMBER, _PLAIN_COUNT, _PLAIN_LENGTH = float, int, int | None
+_PLAIN_EXPONENTS = tuple[float | Literal["auto"], float] | None
+_PLAIN_ILLUMINATION = float | Literal["auto"] | None
+Number = Annotated[_Float, _arg(_PLAIN_NUMBER)]
+Count = Annotated[_Int, _arg(_PLAIN_COUNT)]
+Length = Annotated[_Int | None, _arg(_PLAIN_LENGTH)]
+Exponents = Annotated[tuple[_Float | Literal["auto"], _Float] | None, _arg(_PLAIN_EXPONENTS)]
+Illumination = Annotated[_Float | Literal["auto"] | None, _arg(_PLAIN_ILLUMINATION)]
+TRACEABLE: dict[Any, Any] = {
+    Number: _PLAIN_NUMBER,
+    Count: _PLAIN_COUNT,
+    Length: _PLAIN_LENGTH,
+    Exponents: _PLAIN_EXPONENTS,
+    Illumination: _PLAIN_ILLUMINATION,
+}
+
+EPS = math.exp(-5)  # of Eq. 10
+
+
+@dataclass(frozen=True)
+class ModelConfig:
+    """Shape and initial state of a scene."""
+
+    sh_degree: int = 3  # bands k of Eq. 2; (k+1)^2 coefficients
+    plane_size: int = 64  # cells of a spatial axis at the coarsest scale
+    plane_scales: tuple[int, ...] = (1, 2, 4)  # factors on plane_size, concatenated; time is never scaled
+    plane_channels: int = 16
+    time_size: int | None = None  # cells of the time axis; None: half the number of training frames
+    time_range: Literal["full", "upper"] = "full"  # "upper": t in [0, 1] read as [-1, 1], half of each time plane
+    aggregation: Literal["paired_sum", "product"] = "paired_sum"  # Eq. 1, or the product of all six planes
+    hidden: int = 128  # width of g, of the heads and of OCD-Net
+    opacity_head: bool = False  # a fourth head moves the opacity's logit, as 4DGS can (arXiv 2310.08528)
+    identity_start: bool = False  # heads and OCD-Net start as "no motion, a_j = 1" instead of at random
+    illumination_offset: Number = 0.5  # l = max(offset + sum a_j b_j B_j, 0)
+    # N(0, 1), U(0, 1), or the frames' colours at the points, with the darkening of tone.py undone
+    reflectance_init: Literal["normal", "uniform", "observed"] = "uniform"
+    attenuation_init: Literal["normal", "uniform"] = "uniform"
+    # B1, B2 that BAFE-Net starts at; None: zero bias, 5.5. B1 "auto": what the frames' darkness implies (tone.py)
+    initial_exponents: Exponents = None
+    # l of every Gaussian at the start; None: luminance of the points. "auto": what makes L^B2 the darkening's gain
+    initial_illumination: Illumination = None
+    initial_opacity: Number = 0.1
+    background: float = 0.0  # value of L and R where nothing is drawn
+
+
+@dataclass(frozen=True)
+class LossConfig:
+    """Weights and forms of Eqs. 10-15 and of the plane regularisers."""
+
+    l1_on: Literal["raw", "tonemapped"] = "raw"  # first term of Eq. 10 on I, or on (I + eps)^eta like the second
+    ssim: Number = 1.0
+    eps: Number = EPS
+    eta_start: Number = 0.95
+    eta_end: Number = 0.5
+    eta_restarts: bool = False  # the decay starts anew with the fine stage
+    exposure: Number = 0.01  # lambda_1, Eq. 11
+    exposure_level: Number = 0.6
+    exposure_of: Literal["reflectance", "welllit"] = "reflectance"
+    exposure_window: int | None = 16  # pixels; None: the mean of the whole image
+    exposure_form: Literal["absolute", "squared"] = "absolute"
+    amplification: Number = 0.05  # lambda_2, Eq. 13
+    structure: Number = 1.0  # lambda_3 = lambda_4, Eq. 14
+    structure_beta: Number = 0.5
+    structure_gradient: Literal["components", "magnitude"] = "components"  # forward differences, or sqrt(dx^2 + dy^2)
+    depth: Number = 0.001  # lambda_5, Eq. 12
+    depth_gradient: Literal["forward", "sobel"] = "forward"
+    depth_gain: Number = 1.0  # factor on D inside Eq. 12
+    illumination_tv: Number = 0.0  # mean |forward difference| of L_w
+    exponent_prior: Number = 0.0  # mean |B1 - initial B1|
+    plane_smoothness: Number = 2e-4  # second differences along the space planes' first axis, fine stage only
+    time_smoothness: Number = 1e-3  # second differences in t
+    time_l1: Number = 1e-4  # mean |1 - plane| of the time planes
+
+
+@dataclass(frozen=True)
+class OptimConfig:
+    """Adam and its learning rates. `*_lr` of positions, motion field and networks decay exponentially to `*_lr_end`."""
+
+    means_lr: Number = 1.6e-4
+    means_lr_end: Number = 1.6e-6
+    heads_lr: Number = 1.6e-4  # g and the mu, Q, S heads
+    heads_lr_end: Number = 1.6e-5
+    planes_lr: Number = 1.6e-3
+    planes_lr_end: Number = 1.6e-4
+    ocd_lr: Number = 1.6e-4
+    ocd_lr_end: Number = 1.6e-5
+    bafe_lr: Number = 1.6e-3
+    bafe_lr_end: Number = 1.6e-4
+    extent_scales: tuple[str, ...] = ("means", "heads", "planes")  # groups whose rates are multiplied by the extent
+    illumination_lr: Number = 2.5e-3
+    illumination_rest_divisor: Number = 20.0
+    reflectance_lr: Number = 1e-5
+    attenuation_lr: Number = 1e-5
+    opacity_lr: Number = 0.05
+    scales_lr: Number = 5e-3
+    quats_lr: Number = 1e-3
+    decay_steps: Length = 20_000  # length of the decays; None: the length of the stage
+    beta1: Number = 0.9
+    beta2: Number = 0.999
+    eps: Number = 1e-15
+
+
+@dataclass(frozen=True)
+class DensityConfig:
+    """Clone, split and prune (3D Gaussian Splatting, arXiv 2308.04079, as 4DGS sets it)."""
+
+    start: int = 500  # of each stage, steps
+    stop: int = 10_000
+    interval: int = 100
+    grad_threshold: Number = 2e-4  # mean norm of dL/d(mean2d), normalised device coordinates
+    clone_below: Number = 0.01  # of the extent; larger Gaussians split
+    conserve_opacity: bool = False  # a new pair covers as much as its source did (arXiv 2404.06109)
+    prune_opacity: Number = 0.005
+    prune_above: Count = 0  # prune only when more Gaussians than this exist
+    max_gaussians: Count = 360_000
+
+
+@dataclass(frozen=True)
+class Config:
+    """All settings of a training run; saved as `config.json` in its folder."""
+
+    coarse_steps: int = 3000
+    fine_steps: int = 20_000
+    batch_size: int = 2  # views a step
+    seed: Count = 0
+    downscale: int = 1  # reads images at 1/downscale of their full size
+    format: Layout = "auto"  # of the scene's folder; "auto": found from its contents
+    held_out: str = "auto"  # views not trained on: the scene's own, "4dgs", or k for every k-th (data/splits.py)
+    sh_warmup: int = 1000  # steps between activating one more SH band
+    checkpoint_every: int = 500  # steps
+    frame_memory: float = 4.0  # GiB that a scene's frames may take; beyond it they lie in temporary files
+    model: ModelConfig = field(default_factory=ModelConfig)
+    loss: LossConfig = field(default_factory=LossConfig)
+    optim: OptimConfig = field(default_factory=OptimConfig)
+    density: DensityConfig = field(default_factory=DensityConfig)
+
+    @property
+    def steps(self) -> int:
+        """Length of the whole run."""
+        return self.coarse_steps + self.fine_steps
+
+    def check_steps(self) -> None:
+        """Complain of numbers of steps that make no training.
+
+        Raises:
+            UserError: one is negative, or both are zero.
+        """
+        if self.steps < 1 or min(self.coarse_steps, self.fine_steps) < 0:
+            raise UserError("--coarse-steps and --fine-steps: expected no negative number and at least one step in all")
+
+
+# Settings of how a run is carried out, not of what it computes: they may change when it goes on.
+EXECUTION = frozenset({"checkpoint_every", "frame_memory"})
+
+
+def to_dict(config: Config) -> dict:
+    """The settings as nested dictionaries of JSON values."""
+    return json.loads(json.dumps(dataclasses.asdict(config)))
+
+
+def from_dict(values: dict) -> Config:
+    """The inverse of `to_dict`.
+
+    Raises:
+        TypeError: a setting is unknown.
+    """
+    parts = {"model": ModelConfig, "loss": LossConfig, "optim": OptimConfig, "density": DensityConfig}
+    tuples = lambda items: {key: tuple(v) if isinstance(v, list) else v for key, v in items.items()}
+    return Config(**{key: parts[key](**tuples(v)) if key in parts else v for key, v in values.items()})

@@ -1,0 +1,50 @@
+"""Blocks of very many tiles: every step of a walk is a few launches over all of them.
+
+Never measured on an accelerator. Compiled for one, each step of a loop is a launch or more and each look at whether a
+loop goes on is a read by the host, so blocks are large and the steps within a chunk are unrolled.
+"""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from l2dgs_jax.kernels.blend.blocks import in_blocks
+from l2dgs_jax.kernels.blend.walk import Stride, Sums, add_moments, blend_block, from_moments
+from l2dgs_jax.kernels.tiles import TileLists
+
+BLOCK = 2048  # tiles
+STRIDE = Stride(chunk=8, unroll=True)
+
+
+def blend(packed: Float[Array, "G D"], lists: TileLists, *, width: int, height: int) -> Float[Array, "T C P"]:
+    """See the contract."""
+    blocks, _, position = in_blocks(lists, BLOCK, width, height, packed.dtype)
+    tiles = jax.lax.map(lambda block: blend_block(packed, lists.gaussians, block, STRIDE), blocks)
+    return tiles.reshape(-1, *tiles.shape[2:])[position]
+
+
+def gradient(
+    packed: Float[Array, "G D"],
+    lists: TileLists,
+    output: Float[Array, "T C P"],
+    cotangent: Float[Array, "T C P"],
+    *,
+    width: int,
+    height: int,
+) -> Float[Array, "G D"]:
+    """The gradient of `blend` in `packed`."""
+    blocks, tiles, _ = in_blocks(lists, BLOCK, width, height, packed.dtype)
+    add = partial(add_moments, stride=STRIDE, add_rows=_add_rows)
+    sums, _ = jax.lax.scan(
+        lambda sums, block: (add(sums, packed, lists.gaussians, *block), None),
+        jnp.zeros_like(packed),
+        (blocks, output[tiles], cotangent[tiles]),
+    )
+    return from_moments(packed, sums)
+
+
+def _add_rows(sums: Sums, ids: Int[Array, "K B"], listed: Bool[Array, "K B"], rows: Float[Array, "K B D"]) -> Sums:
+    # Lists that have ended, and tiles that only fill up a block, must not queue for the memory of some Gaussian.
+    return sums.at[jnp.where(listed, ids, len(sums))].add(rows, mode="drop")

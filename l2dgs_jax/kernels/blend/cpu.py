@@ -1,0 +1,58 @@
+"""Small blocks of tiles, one after the other in one native function: their pixels never leave the first cache."""
+
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from l2dgs_jax.kernels import loops
+from l2dgs_jax.kernels.blend import accelerator
+from l2dgs_jax.kernels.blend.blocks import Block, in_blocks
+from l2dgs_jax.kernels.blend.walk import Stride, Sums, add_moments, blend_block, from_moments
+from l2dgs_jax.kernels.compilation import native_call
+from l2dgs_jax.kernels.tiles import TileLists
+
+BLOCK = 8  # tiles
+STRIDE = Stride(chunk=8, unroll=False)
+
+
+def blend(packed: Float[Array, "G D"], lists: TileLists, *, width: int, height: int) -> Float[Array, "T C P"]:
+    """See the contract."""
+    if lists.starts.shape[0] <= BLOCK:  # `native_call` wants loops that the compiler cannot unroll
+        return accelerator.blend(packed, lists, width=width, height=height)
+    blocks, _, position = in_blocks(lists, BLOCK, width, height, packed.dtype)
+
+    def every_block(packed: Float[Array, "G D"], gaussians: Int[Array, " M"], blocks: Block) -> Float[Array, "S B C P"]:
+        return jax.lax.map(lambda block: blend_block(packed, gaussians, block, STRIDE), blocks)
+
+    tiles = native_call(every_block)(packed, lists.gaussians, blocks)
+    return tiles.reshape(-1, *tiles.shape[2:])[position]
+
+
+def gradient(
+    packed: Float[Array, "G D"],
+    lists: TileLists,
+    output: Float[Array, "T C P"],
+    cotangent: Float[Array, "T C P"],
+    *,
+    width: int,
+    height: int,
+) -> Float[Array, "G D"]:
+    """The gradient of `blend` in `packed`."""
+    if lists.starts.shape[0] <= BLOCK:
+        return accelerator.gradient(packed, lists, output, cotangent, width=width, height=height)
+    blocks, tiles, _ = in_blocks(lists, BLOCK, width, height, packed.dtype)
+
+    def every_block(packed: Float[Array, "G D"], gaussians: Int[Array, " M"], *blocks: Any) -> Sums:
+        # Rows beyond a list's end are zero: to leave them out takes longer than to add them.
+        add_rows = lambda sums, ids, listed, rows: loops.add_rows(sums, ids, rows)
+        add = partial(add_moments, stride=STRIDE, add_rows=add_rows)
+        return jax.lax.scan(
+            lambda sums, block: (add(sums, packed, gaussians, *block), None), jnp.zeros_like(packed), blocks
+        )[0]
+
+    return from_moments(
+        packed, native_call(every_block)(packed, lists.gaussians, blocks, output[tiles], cotangent[tiles])
+    )

@@ -1,0 +1,156 @@
+"""The walk along the lists of a block of tiles, which CPUs and accelerators share, and what is computed on the way.
+
+The gradient walks the lists again, front to back, and recomputes alpha: what a pixel's output owes to the Gaussians
+behind the current one is what is left of the output.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from l2dgs_jax.kernels.blend.alpha import GEOMETRY, PIXELS, alpha, pixel_offsets
+from l2dgs_jax.kernels.blend.blocks import Block
+from l2dgs_jax.kernels.tiles import MAX_ALPHA, MIN_TRANSMITTANCE, TILE
+
+Sums = Float[Array, "G D"]
+AddRows = Callable[[Sums, Int[Array, "K B"], Bool[Array, "K B"], Float[Array, "K B D"]], Sums]
+
+
+class Stride(NamedTuple):
+    """How a walk goes: Gaussians of each list between two looks at whether the block has ended, unrolled or not."""
+
+    chunk: int
+    unroll: bool
+
+
+def blend_block(
+    packed: Float[Array, "G D"], gaussians: Int[Array, " M"], block: Block, stride: Stride
+) -> Float[Array, "B C P"]:
+    """The blended features of the tiles of a block."""
+    channels = packed.shape[1] - GEOMETRY
+
+    def add(state: Any, value: Float[Array, "B D"]) -> tuple[Any, None]:
+        transmittance, total = state
+        opaque = alpha(value)
+        after = transmittance * (1 - opaque)
+        weight = jnp.where(after <= MIN_TRANSMITTANCE, 0, transmittance * opaque)
+        return (after, total + value[:, GEOMETRY:, None] * weight[:, None]), None
+
+    size = block.starts.shape[0]
+    state = jnp.ones((size, PIXELS), packed.dtype), jnp.zeros((size, channels, PIXELS), packed.dtype)
+    return _walk(packed, gaussians, block, stride, add, state)[0][1]
+
+
+def add_moments(
+    sums: Sums,
+    packed: Float[Array, "G D"],
+    gaussians: Int[Array, " M"],
+    block: Block,
+    image: Float[Array, "B C P"],
+    g: Float[Array, "B C P"],
+    stride: Stride,
+    add_rows: AddRows,
+) -> Sums:
+    """Add to `sums` what a block contributes to the gradient in `packed`, but for what `from_moments` does.
+
+    Args:
+        sums: of the blocks before.
+        packed: see `blend`.
+        gaussians: all lists, one after the other.
+        block: the tiles.
+        image: the blended features of the tiles.
+        g: their cotangents.
+        stride: how to walk.
+        add_rows: (sums, ids, whether each is of a list, rows) -> sums with the rows added.
+    """
+    channels = range(packed.shape[1] - GEOMETRY)
+    x, y = pixel_offsets(packed.dtype)
+    powers = np.stack([np.ones_like(y), y, y * y])
+    # Sums over pixels are spelled out, rows first and columns last: as vectors of a row's eight pixels, the rows cost
+    # eight additions, and what is left of the columns waits for the end of the chunk.
+    over_rows = lambda x: sum(x[..., TILE * row : TILE * (row + 1)] for row in range(TILE))
+    over_columns = lambda x: sum(x[..., column] for column in range(TILE))
+
+    def pull(state: Any, value: Float[Array, "B D"]) -> tuple[Any, Any]:
+        transmittance, behind = state
+        opaque = alpha(value)
+        after = transmittance * (1 - opaque)
+        ended = after <= MIN_TRANSMITTANCE
+        weight = jnp.where(ended, 0, transmittance * opaque)
+        seen = sum(value[:, GEOMETRY + channel, None] * g[:, channel] for channel in channels)
+        # What the pixel's output owes to the Gaussians behind this one scales with 1 - alpha.
+        behind = behind - weight * seen
+        d_alpha = transmittance * seen - behind / (1 - opaque)
+        d_sigma = jnp.where(ended | (opaque >= MAX_ALPHA), 0, -d_alpha * opaque)
+        return (after, behind), (over_rows(d_sigma[:, None] * powers[None]), over_rows(weight[:, None] * g))
+
+    def consume(sums: Sums, ids: Array, listed: Array, values: Float[Array, "K B D"], updates: Any) -> Sums:
+        moments, features = updates
+        row = x[:TILE][None, None]
+        m, m_x, m_xx = (over_columns(moments[..., 0, :] * factor) for factor in (1, row, row * row))
+        m_y, m_xy = (over_columns(moments[..., 1, :] * factor) for factor in (1, row))
+        m_yy = over_columns(moments[..., 2, :])
+        # From around the middle of the tile to around the mean.
+        mx, my = values[..., 0], values[..., 1]
+        s_x, s_y = m_x - mx * m, m_y - my * m
+        entries = (m, s_x, s_y, m_xx - mx * (m_x + s_x), m_xy - mx * m_y - my * s_x, m_yy - my * (m_y + s_y))
+        moments = jnp.stack(entries, axis=-1)
+        return add_rows(sums, ids, listed, jnp.concatenate([moments, over_columns(features)], axis=-1))
+
+    behind = sum(image[:, channel] * g[:, channel] for channel in channels)
+    return _walk(packed, gaussians, block, stride, pull, (jnp.ones_like(behind), behind), consume, sums)[1]
+
+
+def from_moments(packed: Float[Array, "G D"], sums: Sums) -> Float[Array, "G D"]:
+    """The gradient in `packed` from the moments (0, x, y, xx, xy, yy) of dL/dsigma around each mean, sigma = q / 2."""
+    a, b, c, opacity = packed[:, 2:GEOMETRY].T
+    m, x, y, xx, xy, yy = sums[:, :GEOMETRY].T
+    geometry = [-(a * x + b * y), -(b * x + c * y), 0.5 * xx, xy, 0.5 * yy, -m / jnp.where(opacity == 0, 1, opacity)]
+    return jnp.concatenate([jnp.stack(geometry, axis=-1), sums[:, GEOMETRY:]], axis=-1)
+
+
+def _walk(
+    packed: Float[Array, "G D"],
+    gaussians: Int[Array, " M"],
+    block: Block,
+    stride: Stride,
+    visit: Callable[[Any, Float[Array, "B D"]], tuple[Any, Any]],
+    state: Any,
+    consume: Callable[..., Any] = lambda sums, *_: sums,
+    sums: Any = None,
+) -> tuple[Any, Any]:
+    """Walk the lists of a block front to back until they end or every pixel has.
+
+    Args:
+        packed: see `blend`.
+        gaussians: all lists, one after the other.
+        block: the tiles.
+        stride: how.
+        visit: (state, values [B D]) -> (state, updates), for one Gaussian per tile, means measured from the tile's
+            middle. `state[0]` is the transmittance.
+        state: what it starts from.
+        consume: (sums, ids [K B], whether each is of a list, values [K B D], updates [K ...]) -> sums, for every chunk
+            of K Gaussians.
+        sums: what it starts from.
+    """
+    longest = jnp.max(block.stops - block.starts)
+
+    def unfinished(carry: Any) -> Bool[Array, ""]:
+        step, (transmittance, *_), _ = carry
+        return (step * stride.chunk < longest) & ~jnp.all(transmittance <= MIN_TRANSMITTANCE)
+
+    def body(carry: Any) -> Any:
+        step, state, sums = carry
+        index = block.starts[None] + step * stride.chunk + jnp.arange(stride.chunk, dtype=jnp.int32)[:, None]
+        listed = index < block.stops[None]
+        ids = gaussians[jnp.minimum(index, gaussians.shape[0] - 1)]
+        values = packed[ids].at[..., :2].add(-block.centres[None])
+        values = jnp.where(listed[..., None], values, 0)
+        state, updates = jax.lax.scan(visit, state, values, unroll=stride.unroll)
+        return step + 1, state, consume(sums, ids, listed, values, updates)
+
+    return jax.lax.while_loop(unfinished, body, (0, state, sums))[1:]

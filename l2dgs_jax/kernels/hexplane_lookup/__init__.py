@@ -1,0 +1,73 @@
+"""Interpolation in the six planes of a HexPlane (arXiv 2301.09632; Eq. 1), all scales and all instants at once.
+
+A query fixes the time of all its points, so each space-time plane has collapsed to a line before, and only lookups in
+planes of space and in lines are left. Planes are stored channels last and read through flat row indices: one contiguous
+row a corner. All scales are looked up at once, as the rows of one table.
+"""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from l2dgs_jax.kernels.hexplane_lookup import accelerator, cpu, reference
+from l2dgs_jax.kernels.hexplane_lookup.layout import Cells, Layout, Weights
+from l2dgs_jax.kernels.selection import by_form
+
+__all__ = ["Layout", "lookup"]
+
+Tables = tuple[Float[Array, "R C"], Float[Array, "L C"], Cells, Weights]
+
+
+@partial(jax.custom_vjp, nondiff_argnums=(4,))
+def lookup(
+    space: Float[Array, "R C"], lines: Float[Array, "L C"], cell: Cells, weight: Weights, layout: Layout
+) -> Float[Array, "V M C"]:
+    """The argument of g in Eq. 1 for M = points x scales rows, the scales of a point one after the other.
+
+    Gradients flow to `space`, `lines` and `weight`, in reverse mode only.
+
+    Args:
+        space: planes of space as rows: scale by scale XY, YZ, ZX; the axis named first is the slower one.
+        lines: lines Z, X, Y as rows: scale by scale, each for every view.
+        cell: x, y and z of the cell that a row of the result lies in.
+        weight: how far into it, in [0, 1].
+        layout: what is static.
+    """
+    count, channels = len(cell[0]), space.shape[1]
+    shape = layout.views, count, channels
+    if not count:
+        return jnp.zeros(shape, space.dtype)
+    functions = {
+        "reference": partial(reference.lookup, layout),
+        # A loop of one step would be unrolled, and a native call wants loops.
+        "cpu": partial((cpu if count > 1 else accelerator).lookup, layout),
+        "accelerator": partial(accelerator.lookup, layout),
+    }
+    return by_form(space, lines, cell, weight, **functions, like=jax.ShapeDtypeStruct(shape, space.dtype))
+
+
+def _forward(
+    space: Float[Array, "R C"], lines: Float[Array, "L C"], cell: Cells, weight: Weights, layout: Layout
+) -> tuple[Float[Array, "V M C"], Tables]:
+    return lookup(space, lines, cell, weight, layout), (space, lines, cell, weight)
+
+
+def _backward(layout: Layout, inputs: Tables, cotangent: Float[Array, "V M C"]) -> tuple:
+    space, lines, cell, weight = inputs
+    count = len(cell[0])
+    if count:
+        functions = {
+            "reference": partial(reference.gradient, layout),
+            "cpu": partial((cpu if count > 1 else accelerator).gradient, layout),
+            "accelerator": partial(accelerator.gradient, layout),
+        }
+        gradient = by_form(*inputs, cotangent, **functions, like=(space, lines, weight))
+    else:
+        gradient = jax.tree.map(jnp.zeros_like, (space, lines, weight))
+    return *gradient[:2], jax.tree.map(lambda x: np.zeros(x.shape, jax.dtypes.float0), cell), gradient[2]
+
+
+lookup.defvjp(_forward, _backward)

@@ -1,0 +1,76 @@
+"""Where the rows of the tables lie, and what is interpolated from them."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+# Axes (x, y, z = 0, 1, 2) of the space planes XY, YZ, ZX, and the axis of the time planes Zt, Xt, Yt paired with them.
+SPACE_AXES = ((0, 1), (1, 2), (2, 0))
+TIME_AXES = (2, 0, 1)
+
+Cells = tuple[Int[Array, "*M"], Int[Array, "*M"], Int[Array, "*M"]]
+Weights = tuple[Float[Array, "*M"], Float[Array, "*M"], Float[Array, "*M"]]
+Rows = list[Float[Array, "M C"]]
+OfScale = tuple[Int[Array, "*M"], Int[Array, "*M"], Int[Array, "*M"]]
+Corners = list[list[Int[Array, "*M"]]]  # of the planes
+Ends = list[list[list[Int[Array, "*M"]]]]  # of the lines, for each view
+
+
+class Layout(NamedTuple):
+    """What is static about a lookup.
+
+    Attributes:
+        sizes: cells of a spatial axis at each scale.
+        views: number of instants.
+        aggregation: "paired_sum" (Eq. 1) or "product" of all six features.
+    """
+
+    sizes: tuple[int, ...]
+    views: int
+    aggregation: str
+
+
+def lerp(start: Float[Array, "*S"], end: Float[Array, "*S"], weight: Float[Array, "*S"]) -> Float[Array, "*S"]:
+    """Linear interpolation."""
+    return start + weight * (end - start)
+
+
+def of_scale(layout: Layout, scale: Int[Array, "*M"]) -> OfScale:
+    """Cells of a spatial axis at a scale, and its first rows in the tables of space and of lines."""
+    sizes = np.array(layout.sizes, np.int32)
+    at_scale = lambda x: jnp.asarray(x, jnp.int32).at[scale].get(mode="promise_in_bounds", wrap_negative_indices=False)
+    first = lambda counts: at_scale(np.cumsum(counts) - counts)
+    return at_scale(sizes), first(3 * sizes**2), first(3 * layout.views * sizes)
+
+
+def rows_read(views: int, of_scale: OfScale, cell: Cells) -> tuple[Corners, Ends]:
+    """Rows of the tables that a row of the lookup reads: four corners of each plane, two ends of each time's lines."""
+    size, in_space, in_lines = of_scale
+    corners = [
+        [in_space + (plane * size + cell[a]) * size + cell[b] + offset for offset in (0, 1, size, size + 1)]
+        for plane, (a, b) in enumerate(SPACE_AXES)
+    ]
+    ends = [
+        [
+            [in_lines + (line * views + view) * size + cell[axis] + offset for offset in (0, 1)]
+            for line, axis in enumerate(TIME_AXES)
+        ]
+        for view in range(views)
+    ]
+    return corners, ends
+
+
+def interpolate(corners: list[Rows], ends: list[list[Rows]], weights: Rows, aggregation: str) -> Rows:
+    """For each view, the argument of g in Eq. 1, or the product of all six features."""
+    space = [
+        lerp(lerp(c00, c01, weights[b]), lerp(c10, c11, weights[b]), weights[a])
+        for (a, b), (c00, c01, c10, c11) in zip(SPACE_AXES, corners, strict=True)
+    ]
+    values = []
+    for lines in ends:
+        time = [lerp(start, end, weights[axis]) for axis, (start, end) in zip(TIME_AXES, lines, strict=True)]
+        xy, yz, zx = (plane * line for plane, line in zip(space, time, strict=True))
+        values.append(xy + yz + zx if aggregation == "paired_sum" else xy * yz * zx)
+    return values

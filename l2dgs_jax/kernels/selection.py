@@ -1,0 +1,161 @@
+"""Which form of an operation runs: an explicit setting first, else what suits the platform that it is lowered for."""
+
+import contextlib
+import functools
+import os
+import warnings
+from collections.abc import Callable, Sequence
+from typing import Any, Literal, TypeVar, get_args
+
+import jax
+import numpy as np
+from jax.extend.core import Primitive
+from jax.interpreters import batching, mlir
+
+from l2dgs_jax.kernels.compilation import TRIED, VERSION
+
+Form = Literal["reference", "cpu", "accelerator"]
+FORMS: tuple[Form, ...] = get_args(Form)
+VARIABLE = "L2DGS_JAX_KERNELS"  # of the environment: the form of a whole process
+
+T = TypeVar("T")
+
+
+def _from_environment() -> Form | None:
+    value = os.environ.get(VARIABLE) or None
+    if value not in (None, *FORMS):
+        raise ValueError(f"{VARIABLE} is {value!r}; expected one of {', '.join(FORMS)}")
+    return value
+
+
+# Part of the key under which jax caches what it has traced and compiled.
+_setting = jax.make_user_context(default_value=_from_environment())
+
+
+def use_kernels(form: str | None) -> contextlib.AbstractContextManager[None]:
+    """A context in which every operation takes this form, whatever it is compiled for; None: the platform decides.
+
+    The environment variable L2DGS_JAX_KERNELS sets the same for a whole process.
+
+    Raises:
+        ValueError: there is no such form.
+    """
+    if form not in (None, *FORMS):
+        raise ValueError(f"kernels in the form {form!r}; expected one of {', '.join(FORMS)}, or None")
+    return _setting(form)
+
+
+def chosen_form() -> Form | None:
+    """The explicit setting, if there is one."""
+    return _setting.value
+
+
+def by_form(
+    *arguments: Any, reference: Callable[..., T], cpu: Callable[..., T], accelerator: Callable[..., T], like: Any
+) -> T:
+    """One of three functions of the same values, called with the arguments.
+
+    Without an explicit setting nothing is traced before it is known which platform the program is lowered for:
+    programs for a CPU contain `cpu`, if this compiler was tried with it, and all others `accelerator`. Carries no
+    gradients then: callers define their own.
+
+    Args:
+        *arguments: PyTrees of arrays.
+        reference: the plain form.
+        cpu: the form for CPUs.
+        accelerator: the form for everything else.
+        like: shapes and types of the result, a PyTree of arrays or `jax.ShapeDtypeStruct`s.
+    """
+    form = chosen_form()
+    if form is not None:
+        return {"reference": reference, "cpu": cpu, "accelerator": accelerator}[form](*arguments)
+    leaves, structure = jax.tree.flatten(arguments)
+    shapes, result = jax.tree.flatten(like)
+    # Cotangents of integers are no arrays that a program could take.
+    nothing = jax.dtypes.float0
+    constants = [np.zeros(leaf.shape, nothing) if leaf.dtype == nothing else None for leaf in leaves]
+
+    def on_leaves(function: Callable[..., T]) -> Callable[..., list[Any]]:
+        def call(*taken: Any) -> list[Any]:
+            rest = iter(taken)
+            every = [next(rest) if constant is None else constant for constant in constants]
+            return jax.tree.leaves(function(*jax.tree.unflatten(structure, every)))
+
+        return call
+
+    results = _by_platform.bind(
+        *(leaf for leaf, constant in zip(leaves, constants, strict=True) if constant is None),
+        cpu=on_leaves(cpu),
+        accelerator=on_leaves(accelerator),
+        shapes=tuple((tuple(x.shape), x.dtype) for x in shapes),
+    )
+    return jax.tree.unflatten(result, results)
+
+
+Shapes = tuple[tuple[tuple[int, ...], Any], ...]
+
+_by_platform = Primitive("kernel_by_platform")
+_by_platform.multiple_results = True
+
+
+@_by_platform.def_abstract_eval
+def _shapes(*_: Any, cpu: Callable, accelerator: Callable, shapes: Shapes) -> list[Any]:
+    del cpu, accelerator
+    return [jax.core.ShapedArray(shape, dtype) for shape, dtype in shapes]
+
+
+@_by_platform.def_impl
+def _run(*leaves: Any, cpu: Callable, accelerator: Callable, shapes: Shapes) -> list[Any]:
+    del shapes
+    platforms = {device.platform for leaf in leaves for device in getattr(leaf, "devices", set)()}
+    platform = min(platforms, default=jax.default_backend())
+    return (_for_cpu(cpu, accelerator) if platform == "cpu" else accelerator)(*leaves)
+
+
+def _batch(
+    leaves: Sequence[Any], axes: Sequence[Any], *, cpu: Callable, accelerator: Callable, shapes: Shapes
+) -> tuple[list[Any], list[int]]:
+    size = next(x.shape[axis] for x, axis in zip(leaves, axes, strict=True) if axis is not None)
+    in_axes = tuple(axes)  # None where all members share an argument
+    batched = lambda function: jax.vmap(function, in_axes=in_axes, axis_size=size)
+    results = _by_platform.bind(
+        *leaves,
+        cpu=batched(cpu),
+        accelerator=batched(accelerator),
+        shapes=tuple(((size, *shape), dtype) for shape, dtype in shapes),
+    )
+    return results, [0] * len(results)
+
+
+batching.primitive_batchers[_by_platform] = _batch
+
+
+def _lower_for_cpu(context: Any, *operands: Any, cpu: Callable, accelerator: Callable, shapes: Shapes) -> Any:
+    del shapes
+    return mlir.lower_fun(_for_cpu(cpu, accelerator))(context, *operands)
+
+
+def _lower(context: Any, *operands: Any, cpu: Callable, accelerator: Callable, shapes: Shapes) -> Any:
+    del cpu, shapes
+    return mlir.lower_fun(accelerator)(context, *operands)
+
+
+mlir.register_lowering(_by_platform, _lower)
+mlir.register_lowering(_by_platform, _lower_for_cpu, platform="cpu")
+
+
+def _for_cpu(cpu: Callable, accelerator: Callable) -> Callable:
+    if TRIED:
+        return cpu
+    _warn_of_untried_compiler()
+    return accelerator
+
+
+@functools.cache
+def _warn_of_untried_compiler() -> None:
+    warnings.warn(
+        f"jaxlib {VERSION} was not tried with the fast kernels for CPUs, so this runs several times as slowly as it "
+        "could; expected jaxlib 0.10",
+        RuntimeWarning,
+        stacklevel=2,
+    )

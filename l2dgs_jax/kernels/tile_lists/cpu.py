@@ -1,0 +1,48 @@
+"""A loop over the Gaussians; pairs that touch take the first places."""
+
+from functools import partial
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from l2dgs_jax.kernels.compilation import native_call
+from l2dgs_jax.kernels.loops import Index, loop, read, write
+from l2dgs_jax.kernels.tile_lists.ellipse import reaches_tile
+from l2dgs_jax.kernels.tiles import TILE, Tiling
+
+Listed = tuple[Index, Int[Array, " M1"], Int[Array, " M1"]]  # number of pairs so far, their tiles, their rows
+
+
+def list_pairs(
+    box: Int[Array, "G 4"], ellipse: Float[Array, "G 6"], tiling: Tiling
+) -> tuple[Int[Array, " M"], Int[Array, " M"]]:
+    """See the contract; at least two Gaussians."""
+    views, columns, rows, capacity = tiling
+    count = box.shape[0] // views
+    nowhere = views * columns * rows
+
+    def listed(
+        box: tuple[Int[Array, " G"], ...], ellipse: tuple[Float[Array, " G"], ...]
+    ) -> tuple[Int[Array, " M"], Int[Array, " M"]]:
+        def list_gaussian(slot: Index, state: Listed) -> Listed:
+            left, top, width, height = (read(column, slot) for column in box)
+            own = tuple(read(column, slot) for column in ellipse)
+            first = slot // count * (columns * rows)
+
+            def list_tile(row: Index, column: Index, state: Listed) -> Listed:
+                end, tiles, slots = state
+                x, y = (TILE * index.astype(own[0].dtype) + 0.5 for index in (column, row))
+                # What does not touch is overwritten by the next pair that does; the place after the last is spare.
+                tiles = write(tiles, end, first + row * columns + column)
+                slots = write(slots, end, slot)
+                return jnp.minimum(end + reaches_tile(own, x, y).astype(jnp.int32), capacity), tiles, slots
+
+            in_row = lambda row, state: loop(left + width, partial(list_tile, row), state, first=left)
+            return loop(top + height, in_row, state, first=top)
+
+        tiles = jnp.full(capacity + 1, nowhere, jnp.int32)
+        start = (jnp.int32(0), tiles, jnp.zeros_like(tiles))
+        end, tiles, slots = loop(box[0].shape[0], list_gaussian, start)
+        return write(tiles, end, jnp.int32(nowhere))[:capacity], slots[:capacity]
+
+    return native_call(listed)(tuple(box.T), tuple(ellipse.T))

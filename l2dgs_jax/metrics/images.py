@@ -1,0 +1,125 @@
+"""Image quality: PSNR and SSIM, their masked forms, and the scores of a held-out split."""
+
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from l2dgs_jax.kernels.fusion import separate
+
+RADIUS = 5  # of the 11x11 SSIM window
+SIGMA = 1.5  # pixels
+WINDOW = np.exp(-0.5 * (np.arange(-RADIUS, RADIUS + 1) / SIGMA) ** 2)
+WINDOW /= WINDOW.sum()
+C1, C2 = 0.01**2, 0.03**2  # for values in [0, 1]
+
+Border = Literal["zero", "mirror"]
+Image = Float[Array, "H W C"] | Float[np.ndarray, "H W C"]
+Mask = Bool[Array, "H W"] | Bool[np.ndarray, "H W"]
+
+
+def ssim_map(
+    a: Float[Array, "*B H W C"], b: Float[Array, "*B H W C"], border: Border = "zero"
+) -> Float[Array, "*B H W C"]:
+    """Structural similarity around each pixel, in an 11x11 Gaussian window of sigma 1.5, per channel.
+
+    Source: Wang et al. 2004 with the population covariance. Gradients flow to both images, reverse mode only.
+
+    Args:
+        a: image with values in [0, 1].
+        b: image with values in [0, 1].
+        border: what windows see beyond the image: "zero" (3D Gaussian Splatting's loss) or the image mirrored
+            about its edge (scikit-image).
+    """
+    if border == "mirror":
+        edges = [(0, 0)] * (a.ndim - 3) + [(RADIUS, RADIUS)] * 2 + [(0, 0)]
+        a, b = (jnp.pad(image, edges, "symmetric") for image in (a, b))
+    # Only the sum of the two variances enters SSIM: four blurred images do instead of five.
+    mean_a, mean_b, square, product = map(_blur, (a, b, a * a + b * b, a * b))
+    means = mean_a * mean_b
+    mean_squares = mean_a * mean_a + mean_b * mean_b
+    similarity = ((2 * means + C1) * (2 * (product - means) + C2)) / (
+        (mean_squares + C1) * (square - mean_squares + C2)
+    )
+    return similarity if border == "zero" else similarity[..., RADIUS:-RADIUS, RADIUS:-RADIUS, :]
+
+
+def ssim(a: Float[Array, "*B H W C"], b: Float[Array, "*B H W C"]) -> Float[Array, "*B"]:
+    """Mean SSIM over the windows that lie inside the image, as scikit-image; over all if the image has none."""
+    similarity = ssim_map(a, b, "mirror")
+    height, width = a.shape[-3:-1]
+    if min(height, width) > 2 * RADIUS:
+        similarity = similarity[..., RADIUS:-RADIUS, RADIUS:-RADIUS, :]
+    return similarity.mean((-3, -2, -1))
+
+
+def masked_ssim(
+    a: Float[Array, "*B H W C"], b: Float[Array, "*B H W C"], mask: Bool[Array, "*B H W"]
+) -> Float[Array, "*B"]:
+    """Mean of the SSIM map over a mask, as NSFF (arXiv 2011.13084); NaN where the mask is empty."""
+    return _masked_mean(ssim_map(a, b, "mirror"), mask)
+
+
+def partial_ssim(a: Float[Array, "H W C"], b: Float[Array, "H W C"], mask: Bool[Array, "H W"]) -> Float[Array, ""]:
+    """Mean SSIM over the windows inside the image, of which each sees only its pixels in a mask: DyCheck's mSSIM.
+
+    Source: arXiv 2210.13445 and its code. Sums along a window's side are scaled by its length over the number of pixels
+    that it sees, whatever their weights; windows that see nothing count as equal. For an image without a window inside,
+    `masked_ssim`.
+    """
+    if min(a.shape[:2]) <= 2 * RADIUS:
+        return masked_ssim(a, b, mask)
+
+    def blur(images: Float[Array, "H W C"]) -> Float[Array, "h w C"]:
+        seen = jnp.asarray(mask, images.dtype)[..., None]
+        for axis in (1, 0):
+            shifted = lambda x, axis=axis: [
+                jax.lax.slice_in_dim(x, k, k + x.shape[axis] - 2 * RADIUS, axis=axis) for k in range(len(WINDOW))
+            ]
+            count = jnp.stack(shifted(seen)).sum(0)
+            total = sum(float(w) * x for w, x in zip(WINDOW, shifted(images * seen), strict=True))
+            images = jnp.where(count > 0, total * len(WINDOW) / jnp.maximum(count, 1), 0)
+            seen = jnp.asarray(count > 0, images.dtype)
+        return images
+
+    mean_a, mean_b, square_a, square_b, product = map(blur, (a, b, a * a, b * b, a * b))
+    var_a, var_b = jnp.maximum(square_a - mean_a**2, 0), jnp.maximum(square_b - mean_b**2, 0)
+    bound = jnp.sqrt(var_a * var_b)
+    covariance = jnp.clip(product - mean_a * mean_b, -bound, bound)
+    return (
+        ((2 * mean_a * mean_b + C1) * (2 * covariance + C2)) / ((mean_a**2 + mean_b**2 + C1) * (var_a + var_b + C2))
+    ).mean()
+
+
+def psnr(
+    a: Float[Array, "*B H W C"], b: Float[Array, "*B H W C"], mask: Bool[Array, "*B H W"] | None = None
+) -> Float[Array, "*B"]:
+    """Peak signal to noise ratio in dB for values in [0, 1], of the pixels in `mask` (mPSNR, arXiv 2210.13445).
+
+    Infinite for equal images, NaN where the mask is empty.
+    """
+    error = (a - b) ** 2
+    return -10 * jnp.log10(error.mean((-3, -2, -1)) if mask is None else _masked_mean(error, mask))
+
+
+def _masked_mean(values: Float[Array, "*B H W C"], mask: Bool[Array, "*B H W"]) -> Float[Array, "*B"]:
+    weights = mask.astype(values.dtype)
+    return (values.mean(-1) * weights).sum((-2, -1)) / weights.sum((-2, -1))
+
+
+def _window_mean(images: Float[Array, "*B H W C"]) -> Float[Array, "*B H W C"]:
+    """The mean in a Gaussian window around each pixel, zeros beyond the image."""
+
+    def along(axis: int, x: Float[Array, "*B H W C"]) -> Float[Array, "*B H W C"]:
+        padded = jnp.pad(x, [(RADIUS, RADIUS) if k == x.ndim + axis else (0, 0) for k in range(x.ndim)])
+        shifted = (jax.lax.slice_in_dim(padded, k, k + x.shape[axis], axis=axis) for k in range(len(WINDOW)))
+        return sum((float(weight) * image for weight, image in zip(WINDOW, shifted, strict=True)), jnp.zeros_like(x))
+
+    return along(-2, along(-3, images))
+
+
+_blur = jax.custom_vjp(separate(_window_mean))
+# A symmetric window is its own transpose; the transpose of slices would be a slow sum of padded images.
+_blur.defvjp(lambda images: (_blur(images), None), lambda _, cotangent: (_blur(cotangent),))

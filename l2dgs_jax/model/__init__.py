@@ -1,0 +1,1 @@
+"""The scene as a function of camera and instant (Eqs. 1-9)."""

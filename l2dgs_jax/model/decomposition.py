@@ -1,0 +1,59 @@
+"""Rasterized features -> the well-lit image and the low-light image it must explain (Eqs. 5-9)."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from l2dgs_jax.kernels.fusion import fusion_boundary, repeat_channels
+from l2dgs_jax.model import channels
+from l2dgs_jax.model.networks import apply_bafe
+from l2dgs_jax.types import BAFENet, Decomposition
+
+
+def decompose(features: Float[Array, "*B H W 6"], bafe: BAFENet) -> Decomposition:
+    """Turn blended features into L_w, R_w, B1, B2, I_w and the estimate of I_d.
+
+    Gradients flow, in reverse mode only, to `features` (L_w and R_w: only where they lie in [0, 1], both ends included)
+    and to `bafe`.
+
+    Args:
+        features: blended channels, any real values (Eqs. 5, 6, 8; see `channels`).
+        bafe: parameters of BAFE-Net.
+
+    Returns:
+        The images of Eqs. 5-9; a base of 0 stays 0 in the low-light image and passes no gradient to its exponent.
+    """
+    # Without a boundary the losses' gradient would be computed again for each of the channels.
+    illumination, reflectance, attenuation = fusion_boundary(channels.unpack)(features)
+    illumination, reflectance = clip_unit(illumination), clip_unit(reflectance)
+    attenuation = apply_bafe(bafe, attenuation)
+    return Decomposition(
+        welllit=repeat_channels(illumination, 3) * reflectance,
+        lowlight=repeat_channels(power(illumination, attenuation[..., 1]), 3)
+        * power(reflectance, repeat_channels(attenuation[..., 0], 3)),
+        illumination=illumination,
+        reflectance=reflectance,
+        attenuation=attenuation,
+    )
+
+
+def clip_unit(x: Float[Array, "*S"]) -> Float[Array, "*S"]:
+    """Clip to [0, 1] with slope 1 on the closed interval and 0 outside.
+
+    `jnp.clip` halves the gradient of values that lie exactly on a bound, where saturated pixels gather.
+    """
+    return jnp.where((x >= 0) & (x <= 1), x, jax.lax.stop_gradient(jnp.clip(x, 0, 1)))
+
+
+def power(base: Float[Array, "*S"], exponent: Float[Array, "*E"]) -> Float[Array, "*S"]:
+    """Return base ** exponent for bases >= 0 and exponents > 0, both carrying gradients (Eqs. 9, 10).
+
+    A base of 0, or too small to have a finite reciprocal, gives 0 with zero gradients.
+
+    Args:
+        base: bases.
+        exponent: exponents: one for all, or of the rank of `base` and broadcastable to it.
+    """
+    positive = base >= jnp.finfo(base.dtype).tiny
+    log_base = jnp.log(jnp.where(positive, base, 1))
+    return jnp.where(positive, jnp.exp(exponent * log_base), 0)

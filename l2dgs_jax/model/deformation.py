@@ -1,0 +1,85 @@
+"""Canonical Gaussians and instants -> Gaussians at those instants, lit as their cameras see them (Eqs. 1-4)."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from l2dgs_jax.cameras.geometry import camera_centres
+from l2dgs_jax.config import ModelConfig
+from l2dgs_jax.model import hexplane, networks, spherical_harmonics
+from l2dgs_jax.types import Camera, Gaussians, MovedGaussians, SceneParams
+
+
+def deform(
+    params: SceneParams,
+    alive: Bool[Array, " N"],
+    bounds: Float[Array, "2 3"],
+    cameras: Camera,
+    cfg: ModelConfig,
+    *,
+    moving: bool,
+    sh_degree_active: Int[Array, ""] | int,
+) -> MovedGaussians:
+    """Move and light every Gaussian for V cameras, each at its own instant.
+
+    Gradients flow to every leaf of `params` that takes part and to `cameras`; rows that are not alive get none.
+
+    Args:
+        params: learned values; `params.bafe` is not used.
+        alive: which rows exist. The others come out with opacity 0, whatever their parameters.
+        bounds: lowest and highest corner of the HexPlane's box, world units.
+        cameras: V cameras.
+        cfg: shape of the scene.
+        moving: whether the motion field and OCD-Net act (fine stage); otherwise the canonical Gaussians, with a_j = 1.
+        sh_degree_active: bands of Eq. 2 above this one are left out; may be traced.
+
+    Returns:
+        Activated Gaussians; every field has a leading axis V.
+    """
+    # Garbage in a dead row could overflow the exponential, and 0 * inf would reach the shared networks as NaN.
+    gaussians = jax.tree.map(
+        lambda rows: jnp.where(alive.reshape(-1, *[1] * (rows.ndim - 1)), rows, 0), params.gaussians
+    )
+    per_view = lambda rows: jnp.broadcast_to(rows[None], (*cameras.time.shape, *rows.shape))
+    raw = (gaussians.means, gaussians.quats, gaussians.log_scales, gaussians.logit_opacities)
+    means, quats, log_scales, logit_opacities = map(per_view, raw)
+    coefficients = _active_coefficients(gaussians, cfg.sh_degree, sh_degree_active)
+    if moving:
+        # The same features feed the heads and OCD-Net: Eqs. 1 and 4 name them both f.
+        field = hexplane.features(params.hexplane, gaussians.means, bounds, cameras.time, cfg)
+        hidden, motion = networks.apply_heads(params.heads, field)
+        means, quats, log_scales = means + motion.means, quats + motion.quats, log_scales + motion.log_scales
+        if motion.logit_opacities is not None:
+            logit_opacities += motion.logit_opacities
+        coefficients = networks.apply_ocd(params.ocd, hidden) * coefficients
+    return MovedGaussians(
+        means=means,
+        quats=quats,
+        scales=jnp.exp(log_scales),
+        opacities=jnp.where(alive[None], jax.nn.sigmoid(logit_opacities), 0),
+        illumination=_illumination(coefficients, gaussians.means, cameras.viewmat, cfg),
+        reflectance=per_view(gaussians.reflectance),
+        attenuation=per_view(gaussians.attenuation),
+    )
+
+
+def _active_coefficients(gaussians: Gaussians, degree: int, active: Int[Array, ""] | int) -> Float[Array, "1 N J"]:
+    """The b_j of Eq. 2, those of bands above `active` set to zero."""
+    coefficients = jnp.concatenate([gaussians.illumination_dc, gaussians.illumination_rest], axis=-1)
+    bands = np.repeat(np.arange(degree + 1, dtype=np.int32), 2 * np.arange(degree + 1) + 1)
+    return jnp.where((bands <= jnp.asarray(active, jnp.int32))[None], coefficients, 0)[None]
+
+
+def _illumination(
+    coefficients: Float[Array, "U N J"], means: Float[Array, "N 3"], viewmat: Float[Array, "V 4 4"], cfg: ModelConfig
+) -> Float[Array, "V N"]:
+    """The illumination l of Eqs. 2 and 3, coefficients a_j b_j given for each view or once for all.
+
+    The view direction is taken from the canonical mean: the coefficients belong to the Gaussian, so its motion alone
+    does not change how it is lit. What does change is OCD-Net's part.
+    """
+    centres = camera_centres(viewmat)
+    directions = spherical_harmonics.directions(jnp.broadcast_to(means[None], (len(viewmat), *means.shape)), centres)
+    lit = jnp.sum(coefficients * spherical_harmonics.basis(directions, cfg.sh_degree), axis=-1)
+    return jnp.maximum(cfg.illumination_offset + lit, 0)

@@ -1,0 +1,204 @@
+"""The scene that a training starts from: one Gaussian a point."""
+
+import dataclasses
+import math
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, PRNGKeyArray, Shaped
+from scipy.spatial import cKDTree
+from scipy.special import logit
+
+from l2dgs_jax.cameras.geometry import camera_extent
+from l2dgs_jax.config import ModelConfig
+from l2dgs_jax.data.stacks import pixel_mean, stacked
+from l2dgs_jax.model import hexplane, networks
+from l2dgs_jax.runtime.prefetch import prefetch
+from l2dgs_jax.types import Camera, Gaussians, Scene, SceneParams
+
+SH_DC = 0.28209479177387814  # value of the first SH basis function
+LUMINANCE = np.array([0.2989, 0.587, 0.114])
+SEEN_AT_ONCE = 2**26  # colour values of points that `observed_colors` holds in memory
+
+
+def z_order(points: np.ndarray) -> np.ndarray:
+    """The order of points [P 3] along a Z-order curve (Morton, 1966).
+
+    What lies close in space then mostly lies close in memory, and looking up its features finds them in a cache.
+    """
+    bits = 10
+    low, span = points.min(0), max(float(np.ptp(points, axis=0).max()), 1e-30)
+    cells = ((points - low) / span * (2**bits - 1)).astype(np.int64)
+    interleaved = (((cells[:, axis] >> bit) & 1) << (3 * bit + axis) for bit in range(bits) for axis in range(3))
+    return np.argsort(sum(interleaved), kind="stable")
+
+
+def initialise(
+    key: PRNGKeyArray,
+    points: np.ndarray,
+    colors: np.ndarray | None,
+    cameras: Camera,
+    cfg: ModelConfig,
+    capacity: int,
+    reflectance: np.ndarray | None = None,
+) -> Scene:
+    """A scene with one Gaussian a point, ready for training.
+
+    Scales are the root mean square distance to the three nearest points, illumination the luminance of the point
+    (mid-grey without colours) unless `cfg.initial_illumination` says otherwise, opacity `cfg.initial_opacity`,
+    reflectance and attenuation random (paper, section 4).
+
+    Args:
+        key: randomness of reflectance, attenuation, planes and networks.
+        points: [P 3] world units, P <= capacity.
+        colors: [P 3] sRGB in [0, 1], or None.
+        cameras: the training cameras, [F]; their number sets the time resolution, their spread the extent.
+        cfg: shape and initial state.
+        capacity: rows to allocate; those past P are dead.
+        reflectance: [P 3] initial reflectance, for `cfg.reflectance_init` "observed".
+    """
+    count = len(points)
+    distances, _ = cKDTree(points).query(points, k=min(4, count))
+    mean_square = np.square(distances[:, 1:]).mean(-1) if count > 1 else np.ones(count)
+    if cfg.initial_illumination is not None:
+        illumination = np.full(count, cfg.initial_illumination)
+    else:
+        illumination = np.full(count, 0.5) if colors is None else np.asarray(colors) @ LUMINANCE
+    bias = None if cfg.initial_exponents is None else networks.exponent_bias(cfg.initial_exponents)
+    arrays: tuple = (
+        points,
+        0.5 * np.log(np.maximum(mean_square, 1e-7)),
+        illumination - cfg.illumination_offset,
+        np.full(count, logit(cfg.initial_opacity)),
+        reflectance,
+        bias,
+        camera_extent(cameras),
+    )
+    return _initialise(
+        key,
+        *(None if x is None else jnp.asarray(x, float) for x in arrays),
+        cfg=_shaping(cfg),
+        num_frames=len(cameras.time),
+        capacity=capacity,
+    )
+
+
+def scene_shapes(cfg: ModelConfig, num_frames: int) -> Scene:
+    """Shapes and types of a scene of one Gaussian; nothing is computed.
+
+    Args:
+        cfg: shape of the scene.
+        num_frames: training frames.
+    """
+    rows = [jax.ShapeDtypeStruct(shape, jnp.zeros(()).dtype) for shape in ((1, 3), (1,), (1,), (1,), (1, 3), (2,), ())]
+    build = partial(_initialise, cfg=_shaping(cfg), num_frames=num_frames, capacity=1)
+    return jax.eval_shape(build, jax.eval_shape(lambda: jax.random.key(0)), *rows)
+
+
+def _shaping(cfg: ModelConfig) -> ModelConfig:
+    """The settings without those that are only numbers to start from: scenes that differ in them share a program."""
+    default = ModelConfig()
+    return dataclasses.replace(
+        cfg,
+        illumination_offset=default.illumination_offset,
+        initial_exponents=None,
+        initial_illumination=None,
+        initial_opacity=default.initial_opacity,
+    )
+
+
+@partial(jax.jit, static_argnames=("cfg", "num_frames", "capacity"))
+def _initialise(
+    key: PRNGKeyArray,
+    points: Float[Array, "P 3"],
+    log_scales: Float[Array, " P"],
+    illumination: Float[Array, " P"],
+    logit_opacities: Float[Array, " P"],
+    reflectance: Float[Array, "P 3"] | None,
+    exponent_bias: Float[Array, "2"] | None,
+    extent: Float[Array, ""],
+    *,
+    cfg: ModelConfig,
+    num_frames: int,
+    capacity: int,
+) -> Scene:
+    """See `initialise`; `illumination` is what the spherical harmonics are to give, their offset taken off."""
+    count = len(points)
+    keys = jax.random.split(key, 6)
+    random = {"normal": jax.random.normal, "uniform": jax.random.uniform}
+    gaussians = Gaussians(
+        means=points,
+        quats=jnp.tile(jnp.array([[1.0, 0.0, 0.0, 0.0]]), (count, 1)),
+        log_scales=jnp.tile(log_scales[:, None], (1, 3)),
+        logit_opacities=logit_opacities,
+        illumination_dc=illumination[:, None] / SH_DC,
+        illumination_rest=jnp.zeros((count, (cfg.sh_degree + 1) ** 2 - 1)),
+        reflectance=random[cfg.reflectance_init](keys[0], (count, 3)) if reflectance is None else reflectance,
+        attenuation=random[cfg.attenuation_init](keys[1], (count, 2)),
+    )
+    params = SceneParams(
+        gaussians=jax.tree.map(lambda rows: pad_rows(rows, capacity), gaussians),
+        hexplane=hexplane.init(keys[2], cfg, num_frames),
+        heads=networks.init_heads(keys[3], cfg.plane_channels * len(cfg.plane_scales), cfg),
+        ocd=networks.init_ocd(keys[4], cfg),
+        bafe=networks.init_bafe(keys[5], exponent_bias),
+    )
+    return Scene(
+        params=params,
+        alive=jnp.arange(capacity) < count,
+        bounds=jnp.stack([points.min(0), points.max(0)]),
+        extent=extent,
+    )
+
+
+def observed_colors(
+    points: Float[np.ndarray, "P 3"],
+    cameras: Camera,
+    images: Float[np.ndarray, "F H W 3"],
+    valid: Bool[np.ndarray, "F H W"] | None = None,
+) -> Float[np.ndarray, "P 3"]:
+    """Median colour of the pixels that each point projects to, occlusion ignored; the mean where none are.
+
+    Memory is bounded whatever the numbers of frames and points: colours that take much lie in a temporary file.
+
+    Args:
+        points: world units.
+        cameras: F cameras.
+        images: their images, sRGB in [0, 1].
+        valid: which pixels count; None for all.
+    """
+    height, width = images.shape[1:3]
+
+    def seen_in(frame: int) -> Float[np.ndarray, "P 3"]:
+        """Colours of the points, NaN where they are not to be seen."""
+        viewmat, K, image = np.asarray(cameras.viewmat[frame]), cameras.K[frame], images[frame]
+        x, y, z = K @ (viewmat[:3, :3] @ points.T + viewmat[:3, 3:])
+        depth = np.where(z > 0, z, np.inf)
+        column, row = np.floor(x / depth).astype(int), np.floor(y / depth).astype(int)
+        inside = (z > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        if valid is not None:
+            inside[inside] = valid[frame][row[inside], column[inside]]
+        colors = np.full((len(points), 3), np.nan, images.dtype)
+        colors[inside] = image[row[inside], column[inside]]
+        return colors
+
+    shape = (len(images), len(points), 3)
+    seen = stacked(prefetch(seen_in, range(len(images))), shape, images.dtype, in_file=math.prod(shape) > SEEN_AT_ONCE)
+    some = max(SEEN_AT_ONCE // (3 * len(images)), 1)
+    parts = [_median(seen[:, start : start + some].astype(np.float32)) for start in range(0, len(points), some)]
+    colors = np.concatenate(parts)
+    return np.where(np.isnan(colors).all(-1, keepdims=True), pixel_mean(images, valid).astype(colors.dtype), colors)
+
+
+def _median(seen: Float[np.ndarray, "F P 3"]) -> Float[np.ndarray, "P 3"]:
+    """Median over the frames, without those that are NaN."""
+    last = np.count_nonzero(~np.isnan(seen), axis=0, keepdims=True) - 1
+    seen = np.sort(seen, axis=0)  # NaN last
+    return np.take_along_axis(seen, np.concatenate([last // 2, (last + 1) // 2]), axis=0).mean(0)
+
+
+def pad_rows(rows: Shaped[Array, "N ..."], capacity: int) -> Shaped[Array, "M ..."]:
+    """Append zero rows up to `capacity`."""
+    return jnp.pad(rows, [(0, capacity - rows.shape[0])] + [(0, 0)] * (rows.ndim - 1))

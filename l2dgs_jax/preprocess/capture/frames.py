@@ -1,0 +1,184 @@
+"""Frames out of a video or a folder: how sharp each one is, which to take, and writing those untouched."""
+
+import contextlib
+import math
+import re
+import shutil
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import Float32, Shaped, UInt8
+from tqdm import tqdm
+
+from l2dgs_jax.data import images
+from l2dgs_jax.errors import UserError
+from l2dgs_jax.runtime.files import replacing
+
+SCORED_SIZE = 480  # longer side of the picture whose sharpness is measured, pixels
+
+
+class Candidate(NamedTuple):
+    """A frame that could be taken.
+
+    Attributes:
+        number: its instant, milliseconds into a video or the number in a picture's name; unique and increasing.
+        origin: where it is from: the picture's name, or a position in the video.
+        sharpness: comparable between frames that show about the same.
+    """
+
+    number: int
+    origin: str
+    sharpness: float
+
+    @property
+    def name(self) -> str:
+        """What its picture is called: the number alone, so that a reader can tell its instant."""
+        return f"{self.number:06d}.png"
+
+
+def scan(source: Path) -> list[Candidate]:
+    """Look at every frame of a video, or at every picture of a folder in the order of the numbers in their names.
+
+    Raises:
+        UserError: there is nothing to read, a picture is damaged, or pictures differ in size.
+    """
+    if source.is_dir():
+        return _scan_folder(source)
+    times, scores = [], []
+    with tqdm(desc="decoding", unit="frame", dynamic_ncols=True) as bar:
+        for milliseconds, frame in _decode(source):
+            times.append(round(milliseconds))
+            scores.append(sharpness(frame[..., ::-1].astype(np.float32) / 255))
+            bar.update()
+    # Containers without time stamps say nothing or always the same: the frames are then counted.
+    numbers = times if np.all(np.diff(times) > 0) else range(len(times))
+    return [Candidate(n, f"frame {i}", score) for i, (n, score) in enumerate(zip(numbers, scores, strict=True))]
+
+
+def sample(scores: Sequence[float], count: int) -> list[int]:
+    """Indices of at most `count` frames, evenly spaced as far as taking the sharpest of near neighbours allows.
+
+    Time is divided into `count` equal parts; each gives its sharpest frame out of its middle half.
+    """
+    total = len(scores)
+    if total <= count:
+        return list(range(total))
+    part = total / count
+    reach = max(0.5, part / 4)
+    chosen = []
+    for i in range(count):
+        centre = (i + 0.5) * part - 0.5
+        nearby = range(max(0, math.ceil(centre - reach)), min(total - 1, math.floor(centre + reach)) + 1)
+        chosen.append(max(nearby, key=lambda j: scores[j]))
+    return chosen
+
+
+def extract(source: Path, candidates: Sequence[Candidate], chosen: Sequence[int], folder: Path) -> None:
+    """Write the chosen frames to `folder`, which may hold some of them already from an earlier call.
+
+    PNG files are copied byte by byte; video frames and other pictures become upright PNG of the same pixel values.
+
+    Raises:
+        UserError: a frame cannot be read or written.
+    """
+    missing = {i for i in chosen if not (folder / candidates[i].name).exists()}
+    if not missing:
+        return
+    with tqdm(total=len(missing), desc="frames", unit="frame", dynamic_ncols=True) as bar:
+        if source.is_dir():
+            for i in sorted(missing):
+                _take(source / candidates[i].origin, folder / candidates[i].name)
+                bar.update()
+            return
+        for i, (_, frame) in enumerate(_decode(source)):
+            if i in missing:
+                images.write_image(folder / candidates[i].name, frame[..., ::-1])
+                bar.update()
+            if i == max(missing):
+                break
+
+
+def sharpness(image: Float32[np.ndarray, "H W 3"]) -> float:
+    """Mean squared Laplacian relative to the squared mean brightness, so that exposure does not matter.
+
+    Measured on a small, slightly blurred copy: at full size the noise of a dark frame would pass for detail.
+    """
+    grey = shrink(luma(image), SCORED_SIZE)
+    grey = cv2.GaussianBlur(grey, (0, 0), 1.0)
+    return float(np.square(cv2.Laplacian(grey, cv2.CV_32F)).mean() / max(float(grey.mean()) ** 2, 1e-8))
+
+
+def luma(image: Float32[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "H W"]:
+    """Luma of Rec. 601 in [0, 1], as the matching of features sees it."""
+    return image @ np.array([0.299, 0.587, 0.114], np.float32)
+
+
+def shrink(grey: Shaped[np.ndarray, "H W"], longest: int) -> Shaped[np.ndarray, "h w"]:
+    """Reduce a picture whose longer side exceeds `longest`."""
+    scale = longest / max(grey.shape)
+    return grey if scale >= 1 else cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+
+
+def _scan_folder(folder: Path) -> list[Candidate]:
+    paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in images.SUFFIXES and path.is_file())
+    if not paths:
+        raise UserError(f"{folder}: holds no pictures; expected frames ({', '.join(images.SUFFIXES)})")
+    numbered = sorted(zip(_numbers([path.stem for path in paths]), paths, strict=True))
+    first, candidates = numbered[0][1], []
+    size = images.read_header(first).size
+    for number, path in tqdm(numbered, desc="reading", unit="frame", dynamic_ncols=True):
+        found = images.read_header(path).size
+        if found != size:
+            by = "x".join
+            raise UserError(
+                f"{path}: the picture is {by(map(str, found))} pixels; expected {by(map(str, size))} as {first.name}"
+            )
+        candidates.append(Candidate(number, path.name, sharpness(images.read_image(path))))
+    return candidates
+
+
+def _numbers(stems: Sequence[str]) -> list[int]:
+    """The last number in each name that tells all names apart, or else their places in alphabetical order."""
+    groups = [[int(digits) for digits in re.findall(r"[0-9]+", stem)][::-1] for stem in stems]
+    for numbers in zip(*groups, strict=False):
+        if len(set(numbers)) == len(stems):
+            return list(numbers)
+    return list(range(len(stems)))
+
+
+def _take(path: Path, target: Path) -> None:
+    if path.suffix.lower() == ".png":
+        with replacing(target) as temporary:
+            shutil.copyfile(path, temporary)
+        return
+    values = images.read_image(path)
+    exact = np.abs(images.to_bytes(values) / np.float32(255) - values).max() < 1e-6
+    images.write_image(target, images.to_bytes(values) if exact else np.rint(values * 65535).astype(np.uint16))
+
+
+def _decode(path: Path) -> Iterator[tuple[float, UInt8[np.ndarray, "H W 3"]]]:
+    """Milliseconds and BGR pixels of every frame, turned upright as the container says."""
+    if not path.is_file():
+        raise UserError(f"{path}: no such file or folder; expected a video or a folder of frames")
+    with contextlib.closing(_Capture(path)) as capture:
+        while True:
+            decoded, frame = capture.video.read()
+            if not decoded:
+                return
+            yield capture.video.get(cv2.CAP_PROP_POS_MSEC), frame
+
+
+class _Capture:
+    """OpenCV's reader of a video, to be closed."""
+
+    def __init__(self, path: Path) -> None:
+        self.video: Any = cv2.VideoCapture(str(path))
+        if not self.video.isOpened():
+            raise UserError(f"{path}: not a video that OpenCV can read; expected a video or a folder of frames")
+        self.video.set(cv2.CAP_PROP_ORIENTATION_AUTO, 1)
+
+    def close(self) -> None:
+        self.video.release()

@@ -1,0 +1,53 @@
+"""Dense matches between frames, by optical flow on brightened copies."""
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Float32, UInt8
+
+BLUR = 1.0  # standard deviation in pixels of what takes noise off before matching
+
+
+LOST = 3.0  # pixels from where flow returns to that void a match
+
+
+class Matches(NamedTuple):
+    """A frame's matches with K others.
+
+    Attributes:
+        places: where each pixel is found.
+        errors: pixels between where a match starts and where flow from its end returns to.
+    """
+
+    places: Float32[np.ndarray, "K H W 2"]
+    errors: Float32[np.ndarray, "K H W"]
+
+
+def brightened(images: Float[np.ndarray, "F H W 3"]) -> UInt8[np.ndarray, "F H W"]:
+    """Grey copies for matching: noise blurred away, then one stretch of contrast for all frames."""
+    smooth = lambda image: cv2.GaussianBlur(cv2.cvtColor(image.astype(np.float32), cv2.COLOR_RGB2GRAY), (0, 0), BLUR)
+    sample = [smooth(images[i]) for i in range(0, len(images), max(len(images) // 16, 1))]
+    low, high = np.percentile(sample, (0.5, 99.5))
+    stretched = lambda grey: np.clip((grey - low) / max(high - low, 1e-6), 0, 1)
+    return np.stack([np.round(255 * stretched(smooth(image))).astype(np.uint8) for image in images])
+
+
+def optical_flow(
+    first: UInt8[np.ndarray, "H W"], second: UInt8[np.ndarray, "H W"], finest_scale: int = 0
+) -> Float32[np.ndarray, "H W 2"]:
+    """Dense optical flow by inverse search (DIS, arXiv 1603.03590), down to pixels of 2^`finest_scale`."""
+    search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    search.setFinestScale(finest_scale)
+    return search.calc(first, second, None)  # type: ignore[call-overload]
+
+
+def match(there: Float32[np.ndarray, "H W 2"], back: Float32[np.ndarray, "H W 2"]) -> Matches:
+    """Matches from flow to another view and from there back."""
+    height, width = there.shape[:2]
+    columns, rows = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+    ends = there + np.stack([columns, rows], axis=-1)
+    returned = cv2.remap(back, ends[..., 0], ends[..., 1], cv2.INTER_LINEAR)
+    left = (ends < 0).any(-1) | (ends > (width - 1, height - 1)).any(-1)
+    errors = np.where(left, np.float32(2 * LOST), np.linalg.norm(there + returned, axis=-1))
+    return Matches(ends + np.float32(0.5), errors.astype(np.float32))  # pixel centres lie at +0.5

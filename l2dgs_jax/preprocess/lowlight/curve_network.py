@@ -1,0 +1,149 @@
+"""Exposure-conditioned Zero-DCE: per-pixel darkening curves towards a wanted exposure, learned without references.
+
+The network and its curve are those that LEDNet (arXiv 2202.03373) simulates low light with: Zero-DCE (arXiv 2001.06826)
+with its curve reversed and a second branch that sees the exposure. How its authors trained it is unpublished: the
+losses here are ours. The width is free; 256 channels are the released network.
+"""
+
+from collections.abc import Iterable, Iterator
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from l2dgs_jax.model.networks import apply_conv, init_conv
+from l2dgs_jax.training import optimizer
+from l2dgs_jax.types import Conv
+
+ITERATIONS = 10  # of the curve
+# With Zero-DCE's smoothness of 200 the network learns to even out local tone as it trains, and edges get halos.
+EXPOSURE_WEIGHT, SPATIAL_WEIGHT, SMOOTHNESS_WEIGHT = 10.0, 1.0, 1000.0
+BLOCK = 4  # pixels that the spatial loss averages over, each way
+
+Scalar = Float[Array, ""]
+
+
+class CurveNet(NamedTuple):
+    """Parameters: 3x3 convolutions of the branch that sees the exposure, and of the one that sees the lightness.
+
+    Attributes:
+        exposure: four layers, 1 -> C -> C -> C -> C channels.
+        image: seven layers; the last three also read earlier ones of both branches, and the last gives the curves.
+    """
+
+    exposure: tuple[Conv, ...]
+    image: tuple[Conv, ...]
+
+
+def init(key: PRNGKeyArray, width: int) -> CurveNet:
+    """Xavier-uniform kernels, zero biases.
+
+    Args:
+        key: randomness of the kernels.
+        width: channels C of every hidden layer.
+    """
+    keys = iter(jax.random.split(key, 11))
+    layers = lambda *sizes: tuple(init_conv(next(keys), 3, inputs, outputs) for inputs, outputs in sizes)
+    first = ((1, width), *((width, width),) * 3)
+    last = ((3 * width, width), (3 * width, width), (3 * width, ITERATIONS))
+    return CurveNet(layers(*first), layers(*first, *last))
+
+
+def curves(
+    net: CurveNet, lightness: Float[Array, "*B H W"], exposure: Float[Array, "*B H W"]
+) -> Float[Array, "*B H W 10"]:
+    """The curve parameters of every pixel, in [-1, 1]. Gradients flow to all arguments.
+
+    Args:
+        net: parameters.
+        lightness: in [0, 1].
+        exposure: the lightness wanted around each pixel, in [0, 1].
+    """
+    as_batch = lambda plane: plane.reshape(-1, *plane.shape[-2:], 1)
+    relu_conv = lambda layer, *features: jax.nn.relu(apply_conv(layer, jnp.concatenate(features, -1)))
+    e, x = [as_batch(exposure)], [as_batch(lightness)]
+    for layer in net.exposure:
+        e.append(relu_conv(layer, e[-1]))
+    for layer in net.image[:4]:
+        x.append(relu_conv(layer, x[-1]))
+    x5 = relu_conv(net.image[4], e[4], x[3], x[4])
+    x6 = relu_conv(net.image[5], e[3], x[2], x5)
+    raw = apply_conv(net.image[6], jnp.concatenate([e[2], x[1], x6], -1))
+    return jnp.tanh(raw).reshape(*lightness.shape, ITERATIONS)
+
+
+def iterate(lightness: Float[Array, "*B"], curves: Float[Array, "*B R"]) -> Float[Array, "*B"]:
+    """Apply x <- x + r (x^2 - x) once for every r in `curves`; r > 0 darkens, and x stays in [0, 1] for |r| <= 1.
+
+    Gradients flow to both arguments.
+    """
+    for n in range(curves.shape[-1]):
+        lightness = lightness + curves[..., n] * (lightness * lightness - lightness)
+    return lightness
+
+
+def loss(net: CurveNet, lightness: Float[Array, "B H W"], exposure: Float[Array, "B H W"]) -> Scalar:
+    """The reference-free objective over a batch of images; gradients flow to `net`.
+
+    The exposure is wanted of each image as a whole: wanted of every block, as Zero-DCE wants it, it evens out all tone.
+    """
+    r = curves(net, lightness, exposure)
+    dark = iterate(lightness, r)
+    return (
+        EXPOSURE_WEIGHT * exposure_loss(dark, exposure)
+        + SPATIAL_WEIGHT * spatial_loss(dark, lightness)
+        + SMOOTHNESS_WEIGHT * smoothness_loss(r)
+    )
+
+
+def exposure_loss(dark: Float[Array, "B H W"], exposure: Float[Array, "B H W"]) -> Scalar:
+    """How far the mean of each image is from the mean exposure wanted of it. Gradients flow to both."""
+    return jnp.abs(dark.mean((1, 2)) - exposure.mean((1, 2))).mean()
+
+
+def spatial_loss(dark: Float[Array, "B H W"], lightness: Float[Array, "B H W"]) -> Scalar:
+    """How far steps between neighbouring blocks are from those of the input scaled to the same mean.
+
+    Gradients flow to `dark`, but not through that scale.
+    """
+    mean = lambda image: image.mean((1, 2), keepdims=True)
+    scale = jax.lax.stop_gradient(mean(dark) / jnp.maximum(mean(lightness), 1e-6))
+    return _squared_steps(_block_means(dark - scale * lightness)[..., None])
+
+
+def smoothness_loss(curves: Float[Array, "B H W R"]) -> Scalar:
+    """Squared steps between neighbouring pixels, summed over the curves (Zero-DCE's total variation)."""
+    return curves.shape[-1] * _squared_steps(curves)
+
+
+def train(
+    net: CurveNet, batches: Iterable[tuple[Float[Array, "B H W"], Float[Array, "B H W"]]], rate: optimizer.Schedule
+) -> Iterator[tuple[CurveNet, Scalar]]:
+    """One step of Adam for every batch of lightness and exposure maps; yields the network and the loss before it."""
+    adam = optimizer.adam(jax.tree.map(lambda _: "net", net), {"net": rate}, 0.9, 0.999, 1e-8)
+
+    @jax.jit
+    def step(
+        net: CurveNet, state: optimizer.AdamState, lightness: Float[Array, "B H W"], exposure: Float[Array, "B H W"]
+    ) -> tuple[CurveNet, optimizer.AdamState, Scalar]:
+        value, gradients = jax.value_and_grad(loss)(net, lightness, exposure)
+        move, state = adam.update(gradients, state, net)
+        return jax.tree.map(jnp.add, net, move), state, value
+
+    state = adam.init(net)
+    for lightness, exposure in batches:
+        net, state, value = step(net, state, lightness, exposure)
+        yield net, value
+
+
+def _squared_steps(image: Float[Array, "B H W R"]) -> Scalar:
+    """Mean squared step to the neighbours, over both directions of x and of y."""
+    return 2 * (jnp.square(jnp.diff(image, axis=1)).mean() + jnp.square(jnp.diff(image, axis=2)).mean())
+
+
+def _block_means(image: Float[Array, "B H W"]) -> Float[Array, "B h w"]:
+    batch, height, width = image.shape
+    rows, columns = height // BLOCK, width // BLOCK
+    whole = image[:, : rows * BLOCK, : columns * BLOCK]
+    return whole.reshape(batch, rows, BLOCK, columns, BLOCK).mean((2, 4))

@@ -1,0 +1,216 @@
+"""A low-light twin of a scene, with the scene itself as its truth."""
+
+import dataclasses
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float16, Float32, UInt8
+from tqdm import tqdm
+
+from l2dgs_jax import metrics
+from l2dgs_jax.data.dataset import Dataset, Split
+from l2dgs_jax.data.images import to_bytes
+from l2dgs_jax.errors import UserError
+from l2dgs_jax.preprocess.lowlight import darkening, weights
+from l2dgs_jax.visualize.sheet import sheet
+
+Bytes = UInt8[np.ndarray, "H W 3"]
+
+
+MOST = 1e9  # electrons
+
+
+SAMPLE = 1_000_000  # pixels of a video that the analytic curve is fitted to
+
+
+@dataclass(frozen=True)
+class DarkeningConfig:
+    """How a scene is darkened.
+
+    Attributes:
+        method: one analytic curve for the whole video, or curves by a network, which sees every pixel's neighbourhood.
+        weights: of the network: LEDNet's ce_zerodce.pth or an .npz of experiments.makers.train_darkener; else our own.
+        exposure: mean lightness of the dark frames, saturated pixels aside; drawn from the range if not given.
+        exposure_range: lowest and highest exposure to draw (LEDNet: 0.05 0.3).
+        per_image: draw an exposure for every frame, which makes videos flicker, instead of one for all.
+        photons: electrons that white stands for; gives the sensor noise if set.
+        read_noise: of that sensor, in electrons.
+        lab_order: lightness as it should be, or with red and blue swapped as in LEDNet's script.
+        allow_brightening: let pixels become brighter where the network says so, as LEDNet does.
+        seed: of exposures and noise.
+    """
+
+    method: Literal["analytic", "network"] = "analytic"
+    weights: Path | None = None
+    exposure: float | None = None
+    exposure_range: tuple[float, float] = (0.05, 0.08)
+    per_image: bool = False
+    photons: float | None = None
+    read_noise: float = 2.0
+    lab_order: darkening.LabOrder = "correct"
+    allow_brightening: bool = False
+    seed: int = 0
+
+    def check(self) -> None:
+        """Refuse settings that make no sense.
+
+        Raises:
+            UserError: there is one.
+        """
+        low, high = self.exposure_range if self.exposure is None else (self.exposure,) * 2
+        if not 0 < low <= high < 1:
+            name = "--exposure-range" if self.exposure is None else "--exposure"
+            raise UserError(
+                f"{name}: is {low:g} ... {high:g}; expected mean lightnesses between 0 (black) and 1 (white)"
+            )
+        if self.weights is not None and self.method != "network":
+            raise UserError("--weights: go with --method network; expected that method, or no weights")
+        if self.photons is not None and not (0 < self.photons <= MOST and 0 <= self.read_noise <= MOST):
+            raise UserError(f"--photons and --read-noise: expected electrons, more than 0 and from 0, at most {MOST:g}")
+        if self.seed < 0:
+            raise UserError(f"--seed {self.seed}: expected a whole number from 0")
+
+
+class FrameReport(NamedTuple):
+    """How dark a frame became.
+
+    Attributes:
+        exposure: that was asked for.
+        psnr: dB, of the dark frame against the well-lit one; None if they are equal.
+        level: mean sRGB value of the dark frame.
+        welllit_level: of the well-lit one.
+    """
+
+    exposure: float
+    psnr: float | None
+    level: float
+    welllit_level: float
+
+
+def darken(dataset: Dataset, cfg: DarkeningConfig) -> tuple[Dataset, dict[str, FrameReport]]:
+    """The low-light twin of a scene: its pictures darkened, themselves as the truth; and a report on every frame.
+
+    Colours of points are dropped: they were seen in the light.
+
+    Raises:
+        UserError: the scene is no brighter than the exposure, or has well-lit pictures of some frames only.
+    """
+    names = dataset.train.names + dataset.test.names
+    pictures = [to_bytes(picture) for picture in _sources(dataset)]
+    exposures = _exposures(len(names), cfg)
+    darkener = _darkener(pictures, _counted(dataset), exposures, dataset.name, cfg)
+    frames: dict[str, FrameReport] = {}
+    dark: list[Bytes] = []
+    for i, name in enumerate(tqdm(names, desc="darken", unit="frame", dynamic_ncols=True)):
+        image = _floats(pictures[i])
+        low = darkening.darken(image, exposures[i], darkener(i), cfg.lab_order, cfg.allow_brightening)
+        if cfg.photons is not None:
+            low = darkening.add_sensor_noise(low, (cfg.seed, i), cfg.photons, cfg.read_noise)
+        dark.append(darkening.truncate(low))
+        low = _floats(dark[i])
+        psnr = float(metrics.psnr(jnp.asarray(low), jnp.asarray(image)))
+        finite = psnr if math.isfinite(psnr) else None
+        frames[name] = FrameReport(exposures[i], finite, float(low.mean()), float(image.mean()))
+
+    first = len(dataset.train.names)
+    return dataclasses.replace(
+        dataset,
+        train=_twin(dataset.train, dark[:first], pictures[:first]),
+        test=_twin(dataset.test, dark[first:], pictures[first:]),
+        colors=None,
+    ), frames
+
+
+def contact_sheet(dataset: Dataset, rows: int = 4) -> UInt8[np.ndarray, "H W 3"]:
+    """A few training frames, spread over time: well-lit, dark, and the dark one brought back to the same mean."""
+    split = dataset.train
+    assert split.welllit is not None
+    in_time = np.argsort(split.cameras.time, kind="stable")
+    chosen = in_time[np.unique(np.linspace(0, len(in_time) - 1, rows).round().astype(int))].tolist()
+    gain = float(split.welllit[chosen].mean(dtype=np.float64) / max(split.images[chosen].mean(dtype=np.float64), 1e-6))
+    lines = [
+        (
+            f"{split.names[i]}, time {split.cameras.time[i]:.2f}",
+            [to_bytes(x) for x in (split.welllit[i], split.images[i], gain * split.images[i].astype(np.float32))],
+        )
+        for i in chosen
+    ]
+    return sheet(["well-lit", "low light", f"low light x {gain:.3g}"], lines)
+
+
+def _sources(dataset: Dataset) -> Iterator[Float16[np.ndarray, "H W 3"]]:
+    """The well-lit pictures of all frames: those called so, or else the only ones."""
+    splits = [split for split in (dataset.train, dataset.test) if split.names]
+    known = [split.welllit is not None for split in splits]
+    if any(known) and not all(known):
+        raise UserError(f"{dataset.name}: has well-lit pictures of one split only; expected them of all frames or none")
+    for split in splits:
+        yield from split.images if split.welllit is None else split.welllit
+
+
+def _counted(dataset: Dataset) -> list[Bool[np.ndarray, "H W"]]:
+    """Which pixels of each frame are valid."""
+    everything = np.ones((dataset.height, dataset.width), bool)
+    splits = (dataset.train, dataset.test)
+    return [x for split in splits for x in (len(split.names) * [everything] if split.valid is None else split.valid)]
+
+
+def _exposures(count: int, cfg: DarkeningConfig) -> list[float]:
+    if cfg.exposure is not None:
+        return [cfg.exposure] * count
+    drawn = np.random.default_rng(cfg.seed).uniform(*cfg.exposure_range, count)
+    return drawn.tolist() if cfg.per_image else [float(drawn[0])] * count
+
+
+def _darkener(
+    pictures: Sequence[Bytes],
+    counted: Sequence[Bool[np.ndarray, "H W"]],
+    exposures: Sequence[float],
+    name: str,
+    cfg: DarkeningConfig,
+) -> Callable[[int], darkening.Darkener]:
+    """The darkener of every frame, by its index, as its pixels that count suggest.
+
+    Raises:
+        UserError: the pictures are no brighter than the exposure, or the weights cannot be read.
+    """
+    light = lambda i: darkening.lightness(_floats(pictures[i]), cfg.lab_order)[counted[i]]
+    stride = -(-sum(picture.size // 3 for picture in pictures) // SAMPLE)
+    sample = np.concatenate([light(i)[::stride] for i in range(len(pictures))])
+    if sample.mean() <= darkening.exposure_map(sample, min(exposures)).mean():
+        raise UserError(
+            f"{name}: the mean lightness of its pictures is {sample.mean():.3f}; "
+            f"expected brighter ones than the exposure, {min(exposures):.3f}, or a lower --exposure"
+        )
+    if cfg.method == "network":
+        network = darkening.network_darkener(weights.load(cfg.weights or weights.SHIPPED))
+        return lambda _: network
+    if cfg.per_image:
+        return lambda i: darkening.analytic_darkener(light(i), exposures[i])
+    analytic = darkening.analytic_darkener(sample, exposures[0])
+    return lambda _: analytic
+
+
+def _twin(split: Split, dark: list[Bytes], welllit: list[Bytes]) -> Split:
+    if not dark:
+        return split
+    stack = lambda pictures: np.stack([_floats(picture).astype(np.float16) for picture in pictures])
+    return dataclasses.replace(split, images=stack(dark), welllit=stack(welllit))
+
+
+def _floats(picture: Bytes) -> Float32[np.ndarray, "H W 3"]:
+    return picture.astype(np.float32) / 255
+
+
+def mean_report(frames: dict[str, FrameReport]) -> dict[str, float | None]:
+    """Means of the reports over the frames; None where some frame has none."""
+    columns = zip(*frames.values(), strict=True)
+    return {
+        key: None if None in values else float(np.mean(values))
+        for key, values in zip(FrameReport._fields, columns, strict=True)
+    }

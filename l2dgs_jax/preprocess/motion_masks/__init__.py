@@ -1,0 +1,5 @@
+"""Where things move in a video of known cameras."""
+
+from l2dgs_jax.preprocess.motion_masks.scene_masks import as_taken, compute_masks, preview, write_masks
+
+__all__ = ["as_taken", "compute_masks", "preview", "write_masks"]

@@ -1,0 +1,142 @@
+"""Projection of 3D Gaussians onto the image plane: elliptical weighted averaging (EWA)."""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from l2dgs_jax.kernels.fusion import fusion_boundary
+
+FIELD_MARGIN = 0.3  # of half the field of view: how far outside the image the Jacobian still follows the centre
+
+
+Column = Float[Array, " N"]
+Columns = tuple[Column, ...]
+
+
+class Projected(NamedTuple):
+    """Gaussians on the image plane.
+
+    Attributes:
+        means2d: centres in pixels.
+        covariances2d: (xx, xy, yy) in pixels^2, blur included.
+        conics: (xx, xy, yy) of the inverse of the covariance, pixels^-2.
+        depths: distance along the camera's z axis, world units.
+        visible: whether the centre lies beyond the near plane; values of other rows are finite and meaningless.
+    """
+
+    means2d: Float[Array, "*B N 2"]
+    covariances2d: Float[Array, "*B N 3"]
+    conics: Float[Array, "*B N 3"]
+    depths: Float[Array, "*B N"]
+    visible: Bool[Array, "*B N"]
+
+
+def rotations(quats: Float[Array, "N 4"]) -> Float[Array, "3 3 N"]:
+    """Rotation matrices of quaternions (wxyz) of any norm; a zero quaternion is the identity and has no gradient."""
+    return jnp.stack([jnp.stack(row) for row in _rotation(*_unit(*quats.T))])
+
+
+def project(
+    means: Float[Array, "N 3"],
+    quats: Float[Array, "N 4"],
+    scales: Float[Array, "N 3"],
+    viewmat: Float[Array, "4 4"],
+    K: Float[Array, "3 3"],
+    width: int,
+    height: int,
+    near_plane: float = 0.01,
+    eps2d: float = 0.3,
+) -> Projected:
+    """Project Gaussians by a pinhole camera, to first order around their centres (EWA; 3DGS, arXiv 2308.04079).
+
+    Gradients flow to means, quats, scales, viewmat and K, in reverse mode only, and are zero for Gaussians nearer than
+    the near plane.
+
+    Args:
+        means: centres, world units.
+        quats: rotations, wxyz, any norm.
+        scales: standard deviations along the principal axes, world units.
+        viewmat: world to camera, OpenCV axes.
+        K: intrinsics, pixels; skew moves centres but does not shear the ellipses.
+        width: pixels.
+        height: pixels.
+        near_plane: world units; Gaussians whose centre is nearer are not visible.
+        eps2d: pixels^2, more than 0, added to the projected covariance, so that no Gaussian falls between pixels.
+    """
+    size = jnp.array([width, height], means.dtype)
+    before_camera = fusion_boundary(partial(_before_camera, near_plane=near_plane))
+    visible, depth, normalised = before_camera(tuple(means.T), viewmat)
+    centre, jacobian = _through_lens(depth, normalised, viewmat, K, size)
+    halves = _half(jacobian, _rotation(*_unit(*quats.T)), tuple(scales.T))
+    covariance = fusion_boundary(partial(_covariance, eps2d=eps2d))(*halves)
+    conic = fusion_boundary(partial(_conic, eps2d=eps2d))(*covariance)
+    gather = lambda columns: jnp.stack(columns).T
+    return Projected(gather(centre), gather(covariance), gather(conic), depth, visible)
+
+
+# Every entry of a point or a matrix is a column, one vector over all Gaussians: arithmetic with whole columns is what
+# CPUs are fast at. Columns are kept between the functions; within one they are computed again for each that needs them.
+
+
+@fusion_boundary
+def _unit(w: Column, x: Column, y: Column, z: Column) -> Columns:
+    squared = w * w + x * x + y * y + z * z
+    zero = squared <= 1e-24
+    inverse_norm = jnp.where(zero, 0, 1 / jnp.sqrt(jnp.where(zero, 1, squared)))
+    return tuple(part * inverse_norm for part in (w, x, y, z))
+
+
+@fusion_boundary
+def _rotation(w: Column, x: Column, y: Column, z: Column) -> tuple[Columns, ...]:
+    return (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+
+
+def _before_camera(
+    mean: Columns, viewmat: Float[Array, "4 4"], *, near_plane: float
+) -> tuple[Bool[Array, " N"], Column, Columns]:
+    """Whether a centre is visible, its depth, and where its ray meets the plane at depth 1."""
+    x, y, z = (sum(viewmat[row, k] * mean[k] for k in range(3)) + viewmat[row, 3] for row in range(3))
+    # A NaN depth counts as visible, so that it shows in the image instead of vanishing.
+    visible = ~(z <= near_plane)
+    z = jnp.where(visible, z, 1)
+    return visible, z, tuple(jnp.where(visible, part, 0) / z for part in (x, y))
+
+
+@fusion_boundary
+def _through_lens(
+    depth: Column, normalised: Columns, viewmat: Float[Array, "4 4"], K: Float[Array, "3 3"], size: Float[Array, "2"]
+) -> tuple[Columns, tuple[Columns, ...]]:
+    """The centre in pixels, and the rows of J W, clamped to the field of view."""
+
+    def row(axis: int) -> Columns:
+        focal, centre = K[axis, axis], K[axis, 2]
+        margin = FIELD_MARGIN * 0.5 * size[axis] / focal
+        tangent = jnp.clip(normalised[axis], -(centre / focal + margin), (size[axis] - centre) / focal + margin)
+        return tuple(focal / depth * (viewmat[axis, k] - tangent * viewmat[2, k]) for k in range(3))
+
+    pixel = lambda axis: K[axis, 0] * normalised[0] + K[axis, 1] * normalised[1] + K[axis, 2]
+    return (pixel(0), pixel(1)), (row(0), row(1))
+
+
+@fusion_boundary
+def _half(jacobian: tuple[Columns, ...], rotation: tuple[Columns, ...], scale: Columns) -> tuple[Columns, ...]:
+    """J W R S, whose product with its transpose is the covariance."""
+    return tuple(tuple(scale[j] * sum(row[k] * rotation[k][j] for k in range(3)) for j in range(3)) for row in jacobian)
+
+
+def _covariance(u: Columns, v: Columns, *, eps2d: float) -> Columns:
+    dot = lambda p, q: sum(a * b for a, b in zip(p, q, strict=True))
+    return dot(u, u) + eps2d, dot(u, v), dot(v, v) + eps2d
+
+
+def _conic(xx: Column, xy: Column, yy: Column, *, eps2d: float) -> Columns:
+    # Cauchy-Schwarz bounds the unblurred determinant by zero; the blur keeps this sum positive after rounding too.
+    determinant = (xx - eps2d) * (yy - eps2d) - xy * xy
+    determinant = jnp.maximum(determinant, 0) + eps2d * (xx + yy - eps2d)
+    return yy / determinant, -xy / determinant, xx / determinant

@@ -1,0 +1,173 @@
+"""A tile-based Gaussian rasterizer in plain JAX: cull, sort, scan."""
+
+from functools import partial
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from l2dgs_jax.kernels.blend import blend
+from l2dgs_jax.kernels.fusion import fusion_boundary
+from l2dgs_jax.kernels.tiles import TILE, grid
+from l2dgs_jax.rasterizer.projection import Projected, project
+from l2dgs_jax.rasterizer.tile_lists import Footprints, footprints, intersect, pairs_needed
+from l2dgs_jax.types import RasterOutput
+
+
+def rasterize(
+    means: Float[Array, "*B N 3"],
+    quats: Float[Array, "*B N 4"],
+    scales: Float[Array, "*B N 3"],
+    opacities: Float[Array, "*B N"],
+    features: Float[Array, "*B N C"],
+    viewmat: Float[Array, "*V 4 4"],
+    K: Float[Array, "*V 3 3"],
+    width: int,
+    height: int,
+    *,
+    near_plane: float = 0.01,
+    eps2d: float = 0.3,
+    depth_mode: Literal["accumulated", "expected"] = "accumulated",
+    means2d_probe: Float[Array, "*V N 2"] | None = None,
+    pair_capacity: int | None = None,
+) -> RasterOutput:
+    """Draw Gaussians: all feature channels, alpha and depth in one pass (Eqs. 5, 6 and 8).
+
+    Cameras have no leading axis or one, of views, whose tiles go through one sort and one blend. Gaussians have none,
+    and are then shared by all views, or the same one, and every view has its own. A contribution has
+    alpha = min(0.999, o exp(-q/2)) and is skipped below 1/255; the Gaussian that would bring the transmittance to 1e-4
+    or less ends its pixel and is left out. No background.
+
+    Gradients flow to every array. alpha has none where it is clipped at 0.999.
+
+    Args:
+        means: centres, world units.
+        quats: rotations, wxyz, any norm.
+        scales: standard deviations along the principal axes, world units.
+        opacities: in [0, 1].
+        features: channels to blend.
+        viewmat: world to camera, OpenCV axes.
+        K: intrinsics, pixels.
+        width: pixels.
+        height: pixels.
+        near_plane: world units; Gaussians whose centre is nearer to the camera's plane are not drawn.
+        eps2d: pixels^2, more than 0, added to the projected covariance: no Gaussian falls between pixels.
+        depth_mode: depth along the camera's z axis, world units, as "accumulated", the sum of w z over the Gaussians of
+            a pixel, or "expected", that sum over their accumulated opacity.
+        means2d_probe: added to the projected centres, pixels; zeros, whose gradient is dL/d(mean2d).
+        pair_capacity: room for (Gaussian, tile) pairs of all views. None counts them first, which needs concrete
+            arrays: outside jit and vmap only.
+
+    Raises:
+        ValueError: `pair_capacity` is None under a transformation that hides the arrays' values; or there are Gaussians
+            for other views than there are cameras.
+    """
+    views = viewmat.shape[:-2]
+    gaussians: tuple[Array, ...] = (means, quats, scales, opacities, features)
+    if means.ndim == 2 and views:
+        gaussians = tuple(jnp.broadcast_to(x[None], (*views, *x.shape)) for x in gaussians)
+    elif means.shape[:-2] != views:
+        raise ValueError(f"Gaussians of {means.shape[:-2]} views for {views} cameras; expected as many, or shared ones")
+    arrays = (*gaussians, viewmat, K, means2d_probe)
+    if not views:
+        arrays = jax.tree.map(lambda x: x[None], arrays)
+    static = {"width": width, "height": height, "near_plane": near_plane, "eps2d": eps2d}
+    if pair_capacity is None:
+        try:
+            *geometry, probe = jax.lax.stop_gradient((*arrays[:4], *arrays[5:]))
+            needed = int(count_pairs(*geometry, means2d_probe=probe, **static))
+        except jax.errors.ConcretizationTypeError:
+            raise ValueError("rasterize needs a static pair_capacity under jit or vmap") from None
+        # Three significant bits: at most a quarter of the room is wasted, and few sizes are ever compiled.
+        step = 1 << max(needed.bit_length() - 3, 8)
+        pair_capacity = max(-(-needed // step), 1) * step
+    output = _rasterize(*arrays, **static, capacity=pair_capacity)
+    if depth_mode == "expected":
+        output = output._replace(depth=output.depth / jnp.maximum(output.alpha, 1e-10))
+    return output if views else jax.tree.map(lambda x: x[0] if x.ndim else x, output)
+
+
+def _prepare(
+    means: Float[Array, "V N 3"],
+    quats: Float[Array, "V N 4"],
+    scales: Float[Array, "V N 3"],
+    opacities: Float[Array, "V N"],
+    viewmat: Float[Array, "V 4 4"],
+    K: Float[Array, "V 3 3"],
+    probe: Float[Array, "V N 2"] | None,
+    width: int,
+    height: int,
+    near_plane: float,
+    eps2d: float,
+) -> tuple[Projected, Footprints]:
+    view = partial(project, width=width, height=height, near_plane=near_plane, eps2d=eps2d)
+    projected = jax.vmap(view)(means, quats, scales, viewmat, K)
+    if probe is not None:
+        projected = projected._replace(means2d=projected.means2d + probe)
+    return projected, footprints(*jax.lax.stop_gradient((projected, opacities)), width, height)
+
+
+@partial(jax.jit, static_argnames=("width", "height", "near_plane", "eps2d"))
+def count_pairs(
+    means: Float[Array, "V N 3"],
+    quats: Float[Array, "V N 4"],
+    scales: Float[Array, "V N 3"],
+    opacities: Float[Array, "V N"],
+    viewmat: Float[Array, "V 4 4"],
+    K: Float[Array, "V 3 3"],
+    width: int,
+    height: int,
+    *,
+    near_plane: float = 0.01,
+    eps2d: float = 0.3,
+    means2d_probe: Float[Array, "V N 2"] | None = None,
+) -> Int[Array, ""]:
+    """The `pair_capacity` that `rasterize` needs for the same arguments, at most 2^31 - 1."""
+    cameras = viewmat, K, means2d_probe, width, height, near_plane, eps2d
+    return pairs_needed(_prepare(means, quats, scales, opacities, *cameras)[1])
+
+
+@partial(jax.jit, static_argnames=("width", "height", "near_plane", "eps2d", "capacity"))
+def _rasterize(
+    means: Float[Array, "V N 3"],
+    quats: Float[Array, "V N 4"],
+    scales: Float[Array, "V N 3"],
+    opacities: Float[Array, "V N"],
+    features: Float[Array, "V N C"],
+    viewmat: Float[Array, "V 4 4"],
+    K: Float[Array, "V 3 3"],
+    probe: Float[Array, "V N 2"] | None,
+    *,
+    width: int,
+    height: int,
+    near_plane: float,
+    eps2d: float,
+    capacity: int,
+) -> RasterOutput:
+    cameras = viewmat, K, probe, width, height, near_plane, eps2d
+    projected, boxes = _prepare(means, quats, scales, opacities, *cameras)
+    pairs = pairs_needed(boxes)
+    lists = intersect(jax.lax.stop_gradient(projected), boxes, width, height, capacity)
+
+    channels = [features, projected.depths[..., None], jnp.ones_like(opacities)[..., None]]
+    packed = jnp.concatenate([projected.means2d, projected.conics, opacities[..., None], *channels], axis=-1)
+    blended = blend(packed.reshape(-1, packed.shape[-1]), lists, width, height)
+
+    image = fusion_boundary(partial(_untiled, width=width, height=height))(blended)
+    return RasterOutput(
+        features=image[..., :-2],
+        alpha=image[..., -1],
+        depth=image[..., -2],
+        means2d=projected.means2d,
+        radii=jnp.max(boxes.radii, axis=-1),
+        pairs=pairs,
+        overflow=pairs > capacity,
+    )
+
+
+def _untiled(tiles: Float[Array, "T C P"], width: int, height: int) -> Float[Array, "V H W C"]:
+    """The images that tiles belong to."""
+    columns, rows = grid(width, height)
+    image = tiles.reshape(-1, rows, columns, tiles.shape[1], TILE, TILE).transpose(0, 1, 4, 2, 5, 3)
+    return image.reshape(-1, rows * TILE, columns * TILE, tiles.shape[1])[:, :height, :width]

@@ -1,0 +1,60 @@
+"""The folder of a training run: what lies where, and how the other commands open it."""
+
+import json
+from pathlib import Path
+
+from l2dgs_jax.config import Config, from_dict, to_dict
+from l2dgs_jax.data import load_dataset
+from l2dgs_jax.errors import UserError
+from l2dgs_jax.runs import checkpoints
+from l2dgs_jax.runs.run import Run
+from l2dgs_jax.runtime.files import make_folder, write_json
+
+SETTINGS = "config.json"
+CHECKPOINT = "checkpoint.npz"
+COARSE = "coarse.npz"  # the state at the end of the coarse stage
+METRICS = "metrics.jsonl"
+CONTACT_SHEET = "contact_sheet.png"
+VIDEO = "video.mp4"
+
+
+def write_settings(folder: Path, scene: str, config: Config) -> None:
+    """Create the run folder and its `config.json`.
+
+    Raises:
+        UserError: the folder cannot be made or written to.
+    """
+    make_folder(folder)
+    write_json(folder / SETTINGS, {"scene": scene, "settings": to_dict(config)})
+
+
+def read_settings(folder: Path) -> tuple[str, Config]:
+    """The scene and the settings of a run.
+
+    Raises:
+        UserError: the folder is no run, or its settings cannot be read.
+    """
+    path = folder / SETTINGS
+    try:
+        content = json.loads(path.read_text())
+        return content["scene"], from_dict(content["settings"])
+    except (FileNotFoundError, NotADirectoryError):
+        raise UserError(f"{folder}: not a training run; expected a folder with {SETTINGS}") from None
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise UserError(f"{path}: unreadable settings ({error}); expected those that train wrote") from None
+
+
+def open_run(folder: str | Path, stage: str = "final") -> Run:
+    """Open a run's last checkpoint (`stage` "final") or the one at the end of its coarse stage ("coarse").
+
+    Raises:
+        UserError: settings, scene or checkpoint are missing or do not fit together.
+    """
+    folder = Path(folder)
+    scene, config = read_settings(folder)
+    path = folder / {"final": CHECKPOINT, "coarse": COARSE}[stage]
+    if not path.exists():
+        raise UserError(f"{path}: no such checkpoint; expected a run that has got that far")
+    dataset = load_dataset(scene, config.downscale, config.format, config.held_out, config.frame_memory)
+    state = checkpoints.load(path, config, len(dataset.train.names)).state
+    return Run(config, dataset, state, folder)

@@ -1,0 +1,94 @@
+"""Files and folders that are written whole or not at all."""
+
+import contextlib
+import json
+import os
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from l2dgs_jax.errors import UserError
+
+
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """A temporary file beside `path` to write to; it takes the place of `path` if the block ends without an error.
+
+    Raises:
+        UserError: the folder is missing or not writable, or `path` is a folder.
+    """
+    if not path.parent.is_dir():
+        raise UserError(f"{path}: cannot be written; expected an existing folder {path.parent}")
+    if path.is_dir():
+        raise UserError(f"{path}: is a folder; expected a file to write")
+    temporary = path.with_name(f"{path.stem}.tmp{path.suffix}")
+    try:
+        yield temporary
+        os.replace(temporary, path)
+    except OSError as error:
+        raise UserError(f"{path}: cannot be written ({error.strerror}); expected a writable folder") from None
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def make_folder(path: Path) -> None:
+    """Make a folder and those above it, unless they exist.
+
+    Raises:
+        UserError: it cannot be made.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"{path}: cannot be made ({error.strerror}); expected a writable place") from None
+
+
+@contextlib.contextmanager
+def new_folder(path: Path) -> Iterator[Path]:
+    """A temporary folder beside `path` to fill; it becomes `path` if the block ends without an error.
+
+    Raises:
+        UserError: `path` exists and is no empty folder, or its place is not writable.
+    """
+    expect_new(path)
+    target = path.absolute()
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(
+            dir=target.parent, prefix=f".{target.name}.", ignore_cleanup_errors=True
+        ) as top:
+            filled = Path(top) / target.name
+            filled.mkdir()
+            yield filled
+            if target.exists():
+                target.rmdir()
+            os.rename(filled, target)
+    except OSError as error:
+        raise UserError(f"{path}: cannot be written ({error.strerror}); expected a writable place") from None
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Write what JSON can hold, whole or not at all, making the folder that it goes to.
+
+    Raises:
+        UserError: the folder cannot be made, or else as `replacing`.
+    """
+    make_folder(path.parent)
+    with replacing(path) as temporary:
+        temporary.write_text(json.dumps(content, indent=2) + "\n")
+
+
+def is_taken(path: Path) -> bool:
+    """Whether something is there already, other than an empty folder."""
+    return path.exists() and (not path.is_dir() or any(path.iterdir()))
+
+
+def expect_new(path: Path) -> None:
+    """Complain early of what `new_folder` would complain of.
+
+    Raises:
+        UserError: `path` exists and is no empty folder.
+    """
+    if path.is_symlink() or is_taken(path):
+        raise UserError(f"{path}: exists already; expected a new or an empty folder to write to")

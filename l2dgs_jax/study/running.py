@@ -1,0 +1,181 @@
+"""All members of a study trained, scored and tabulated."""
+
+import json
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import jax
+from jax.sharding import Mesh
+from tqdm import tqdm
+
+from l2dgs_jax import runs
+from l2dgs_jax.config import to_dict
+from l2dgs_jax.data.images import write_image
+from l2dgs_jax.errors import UserError
+from l2dgs_jax.runs import Recorder, Run, checkpoints
+from l2dgs_jax.runs.scores import evaluate
+from l2dgs_jax.runtime import devices, distributed
+from l2dgs_jax.runtime.files import is_taken, make_folder, write_json
+from l2dgs_jax.study import report
+from l2dgs_jax.study.grouping import Trial, load_groups
+from l2dgs_jax.study.spec import Plan, Spec
+from l2dgs_jax.training import DivergedError, Member, Progress, engine, initial_state
+from l2dgs_jax.visualize import contact_sheet
+
+PLANS = "study.json"  # the members that OUT holds
+
+
+DIVERGED = "diverged.json"  # in the folder of a member that is frozen
+
+
+def run_study(spec: Spec, output: Path, *, resume: bool = False, device_count: int | None = None) -> list[str]:
+    """Train, score and tabulate all members of a study, together with the other processes if there are some.
+
+    Args:
+        spec: of `study.spec.read`.
+        output: the study's folder.
+        resume: go on with what the folder holds.
+        device_count: how many devices the members of a group are spread over, at most one each; None for all.
+
+    Returns:
+        Names of the files in `output` that compare the members.
+
+    Raises:
+        UserError: a scene cannot be read, the folder holds another study or cannot be written, or there are too few
+            devices or members.
+    """
+    _claim(output, spec.plans, resume)
+    groups = load_groups(spec)
+    meshes = [_mesh(group, device_count or jax.device_count()) for group in groups]
+    distributed.barrier("all scenes are read")
+    for index, (group, mesh) in enumerate(zip(groups, meshes, strict=True)):
+        if jax.process_index() == 0:
+            size, count = f"{group[0].dataset.width}x{group[0].dataset.height}", mesh.size if mesh else 1
+            print(f"group {index + 1} of {len(groups)}: {len(group)} members at {size}, devices: {count}")
+        _train(group, output, mesh)
+        distributed.barrier("the group is trained")
+        for trial in group[jax.process_index() :: jax.process_count()]:
+            _score(trial, output)
+    distributed.barrier("all members are scored")
+    if jax.process_index() > 0:
+        return []
+    return report.write(output, [plan.name for plan in spec.plans])
+
+
+def _claim(output: Path, plans: Sequence[Plan], resume: bool) -> None:
+    """Write what the folder is for, or compare it with what it was for."""
+    described = [{"name": p.name, "scene": p.scene, "settings": to_dict(p.config)} for p in plans]
+    path = output / PLANS
+    if resume:
+        try:
+            held = json.loads(path.read_text())
+        except (OSError, ValueError):
+            raise UserError(f"{output}: holds no study to resume; expected a folder that sweep wrote") from None
+        if held != described:
+            raise UserError(f"{output}: holds a study of other members or settings; expected the same file again")
+    elif is_taken(output):
+        raise UserError(f"{output}: already holds a study or files; expected a new folder, or --resume")
+    distributed.barrier("the folder is looked at")
+    if jax.process_index() == 0 and not resume:
+        make_folder(output)
+        write_json(path, described)
+
+
+def _mesh(group: Sequence[Trial], device_count: int) -> Mesh | None:
+    try:
+        return devices.mesh(min(device_count, len(group)))
+    except ValueError as error:
+        names = f"{group[0].plan.name} and {len(group) - 1} members like it"
+        raise UserError(f"{names}: {error}; expected fewer processes, or other --devices") from None
+
+
+def _train(group: Sequence[Trial], output: Path, mesh: Mesh | None) -> None:
+    """Train what is neither finished nor frozen, from where it stands."""
+    members: dict[str, Member] = {}
+    pair_capacity = None
+    for trial in group:
+        folder, config = output / trial.plan.name, trial.config
+        if (folder / DIVERGED).exists():
+            continue
+        if (folder / runs.CHECKPOINT).exists():
+            state, needed = checkpoints.load(folder / runs.CHECKPOINT, config, len(trial.dataset.train.names))
+            pair_capacity = max(needed, pair_capacity or 0)
+        else:
+            state = initial_state(trial.dataset, config)
+        if int(state.step) < config.steps:
+            members[trial.plan.name] = Member(trial.dataset.train, config, state)
+    distributed.barrier("all checkpoints are read")
+    if not members:
+        return
+    if jax.process_index() == 0:
+        for trial in group:
+            runs.write_settings(output / trial.plan.name, trial.plan.scene, trial.config)
+    distributed.barrier("all folders are made")
+    followers: list[_Follower] | None = None
+    try:
+        for progress in _steps(list(members.values()), pair_capacity, mesh):
+            if followers is None:
+                own = [index for index in devices.own_rows(progress.states.step) if index < len(members)]
+                followers = [_Follower(output / list(members)[i], list(members.values())[i], i) for i in own]
+            for follower in followers:
+                follower.follow(progress)
+    finally:
+        for follower in followers or ():
+            follower.bar.close()
+
+
+def _steps(members: Sequence[Member], pair_capacity: int | None, mesh: Mesh | None) -> Iterator[Progress]:
+    """The steps of a training, also the one after which no member is left."""
+    try:
+        yield from engine.run(members, pair_capacity, mesh)
+    except DivergedError as error:
+        yield error.progress
+
+
+class _Follower:
+    """Records one member in its folder and shows how it goes, until it diverges."""
+
+    def __init__(self, folder: Path, member: Member, index: int):
+        self.folder, self.index, self.done = folder, index, int(member.state.step)
+        self.record = Recorder(folder, member.config, self.done)
+        self.bar = tqdm(total=member.config.steps, initial=self.done, unit="step", desc=folder.name, dynamic_ncols=True)
+        self.frozen = False
+
+    def follow(self, progress: Progress) -> None:
+        if self.frozen or progress.step <= self.done:
+            return
+        if int(devices.member(progress.states.step, self.index)) < progress.step:
+            self.frozen = True
+            self._freeze(progress)
+            return
+        self.bar.update()
+        line = self.record(progress, self.index)
+        if line:
+            self.bar.set_postfix_str(f"{line['psnr']:.1f} dB, {line['gaussians']} Gaussians")
+
+    def _freeze(self, progress: Progress) -> None:
+        """Keep the last state that could be trusted, and say what was found after it."""
+        self.record.save(progress, self.index, runs.CHECKPOINT)
+        terms = devices.member(progress.report.terms, self.index)
+        found = {"step": progress.step - 1, "terms": {name: str(float(value)) for name, value in terms.items()}}
+        write_json(self.folder / DIVERGED, found)
+        self.bar.set_postfix_str(f"diverged at step {found['step']}, frozen")
+
+
+def _score(trial: Trial, output: Path) -> None:
+    """Score a trained member, unless that was done before the study was interrupted."""
+    folder, config = output / trial.plan.name, trial.config
+    path = folder / report.RESULT
+    if path.exists():
+        return
+    state = checkpoints.load(folder / runs.CHECKPOINT, config, len(trial.dataset.train.names)).state
+    run = Run(config, trial.dataset, state, folder)
+    write_image(folder / runs.CONTACT_SHEET, contact_sheet(run))
+    diverged = (folder / DIVERGED).exists()
+    result = {
+        "scene": trial.plan.scene,
+        "varied": trial.plan.varied,
+        "ended": f"diverged at step {int(state.step)}" if diverged else "finished",
+        "scores": evaluate(run),
+    }
+    write_json(path, result)

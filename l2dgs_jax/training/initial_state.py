@@ -1,0 +1,65 @@
+"""The state that a training starts from."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+
+from l2dgs_jax.config import Config
+from l2dgs_jax.data.dataset import Dataset, Split
+from l2dgs_jax.model import networks
+from l2dgs_jax.model.initialisation import initialise, observed_colors, scene_shapes, z_order
+from l2dgs_jax.model.tone import Darkening, darkening
+from l2dgs_jax.runtime.capacity import next_capacity
+from l2dgs_jax.training.step import TrainState, begin_stage
+
+
+def split_darkening(split: Split, config: Config) -> Darkening:
+    """How the frames are darker than `config.loss.exposure_level`."""
+    return darkening(split.mean_level, float(config.loss.exposure_level))
+
+
+def resolve(config: Config, split: Split) -> Config:
+    """The settings with what they leave to the data filled in from the training frames."""
+    model = config.model
+    if "auto" not in (*(model.initial_exponents or ()), model.initial_illumination):
+        return config
+    exponent, gain = split_darkening(split, config)
+    if model.initial_exponents and model.initial_exponents[0] == "auto":
+        model = dataclasses.replace(model, initial_exponents=(round(exponent, 3), model.initial_exponents[1]))
+    if model.initial_illumination == "auto":
+        b2 = model.initial_exponents[1] if model.initial_exponents else networks.EXPONENT_CENTRE
+        model = dataclasses.replace(model, initial_illumination=round(gain ** (1 / b2), 3))
+    return dataclasses.replace(config, model=model)
+
+
+def initial_state(dataset: Dataset, config: Config) -> TrainState:
+    """The state before the first step of a `resolve`d config; the same seed and data give the same state."""
+    order, train = z_order(dataset.points), dataset.train
+    points, colors = dataset.points[order], None if dataset.colors is None else dataset.colors[order]
+    capacity = len(points)
+    if config.density.start < config.density.stop:
+        capacity = next_capacity(min(1.5 * capacity, max(int(config.density.max_gaussians), capacity)))
+    reflectance = None
+    if config.model.reflectance_init == "observed":
+        law = split_darkening(train, config)
+        observed = observed_colors(points, train.cameras, train.images, train.valid)
+        reflectance = (observed / law.gain) ** (1 / law.exponent)
+    scene = initialise(jax.random.key(config.seed), points, colors, train.cameras, config.model, capacity, reflectance)
+    return _begin_stage(scene, jnp.zeros((), jnp.int32), config, config.coarse_steps)
+
+
+def state_shapes(config: Config, num_frames: int) -> TrainState:
+    """Shapes and types of a training's states, but for the number of Gaussians, which is 1; nothing is computed.
+
+    Args:
+        config: its settings.
+        num_frames: training frames of its scene.
+    """
+    scene = scene_shapes(config.model, num_frames)
+    return jax.eval_shape(
+        lambda scene: begin_stage(scene, jnp.zeros((), jnp.int32), config, config.coarse_steps), scene
+    )
+
+
+_begin_stage = jax.jit(begin_stage, static_argnames=("config", "stage_steps"))

@@ -1,0 +1,231 @@
+"""A training step of one scene as pure functions: the objective, the update, the start of a stage, densification."""
+
+from typing import NamedTuple, TypeVar
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from l2dgs_jax.config import Config
+from l2dgs_jax.model import hexplane
+from l2dgs_jax.model.initialisation import pad_rows
+from l2dgs_jax.model.rendering import render
+from l2dgs_jax.training import densification, losses, optimizer
+from l2dgs_jax.training.densification import GrowthStats
+from l2dgs_jax.training.parameter_groups import groups, schedules
+from l2dgs_jax.types import Camera, Scene, SceneParams
+
+T = TypeVar("T")
+
+
+class Batch(NamedTuple):
+    """The views of one step; images are sRGB in [0, 1], and nothing is learned where they are not `valid`."""
+
+    cameras: Camera
+    images: Float[Array, "*S V H W 3"]
+    valid: Bool[Array, "*S V H W"] | None = None
+
+
+class TrainState(NamedTuple):
+    """All that a step reads and writes, and all that a checkpoint holds. `step` counts finished steps."""
+
+    scene: Scene
+    adam: optimizer.AdamState
+    stats: GrowthStats
+    step: Int[Array, "*S"]
+
+
+class StepReport(NamedTuple):
+    """What a step found. The state is unchanged if the pair buffer overflowed or a gradient was not finite.
+
+    Attributes:
+        loss: Eq. 15 plus the plane regularisers.
+        terms: each term, unweighted.
+        psnr: of the low-light estimate against the input, dB, before the step.
+        pairs: (Gaussian, tile) pairs that the step needs; where views are spread over devices, on the fullest one.
+        overflow: whether they did not fit.
+        finite: whether loss and gradient are.
+    """
+
+    loss: Float[Array, "*S"]
+    terms: dict[str, Float[Array, "*S"]]
+    psnr: Float[Array, "*S"]
+    pairs: Int[Array, "*S"]
+    overflow: Bool[Array, "*S"]
+    finite: Bool[Array, "*S"]
+
+
+def sh_degree(step: Int[Array, ""] | int, config: Config) -> Int[Array, ""] | int:
+    """SH bands in use after `step` steps: one more every `config.sh_warmup`."""
+    return jnp.minimum(step // max(config.sh_warmup, 1), config.model.sh_degree)
+
+
+def exponent_target(config: Config) -> float | Float[Array, ""]:
+    """Where the prior of `config.loss.exponent_prior` pulls B1: its start, or 1 if that is left to chance."""
+    start = config.model.initial_exponents
+    return start[0] if start else 1.0  # type: ignore[return-value]  # "auto" is resolved by then
+
+
+def objective(
+    params: SceneParams,
+    probe: Float[Array, "V N 2"],
+    state: TrainState,
+    batch: Batch,
+    config: Config,
+    moving: bool,
+    pair_capacity: int,
+    axis: str | None = None,
+) -> tuple[Float[Array, ""], tuple[StepReport, Float[Array, "V N"]]]:
+    """Eq. 15 plus the plane regularisers of 4DGS (arXiv 2310.08528), for one batch.
+
+    Gradients flow to `params` and to `probe`, zeros added to the projected centres. The loss is that of the views at
+    hand: with views spread over the devices of `axis`, its mean over them is the loss of all views.
+
+    Returns:
+        The loss, and (the report, the Gaussians' radii in every view).
+    """
+    height, width = batch.images.shape[1:3]
+    output = render(
+        state.scene._replace(params=params),
+        batch.cameras,
+        config.model,
+        width,
+        height,
+        moving=moving,
+        sh_degree=sh_degree(state.step, config),
+        pair_capacity=pair_capacity,
+        means2d_probe=probe,
+    )
+    cfg = config.loss
+    start, steps = (config.coarse_steps, config.fine_steps) if moving else (0, config.coarse_steps)
+    eta = losses.eta(state.step - start, steps, cfg) if cfg.eta_restarts else losses.eta(state.step, config.steps, cfg)
+    target, counted = targets(batch, output.images.lowlight)
+    loss, terms = losses.total(output, target, cfg, eta, exponent_target(config))
+    if moving:
+        smoothness, time_smoothness, time_l1 = hexplane.regularisers(params.hexplane)
+        loss += cfg.plane_smoothness * smoothness + cfg.time_smoothness * time_smoothness + cfg.time_l1 * time_l1
+    squares = jnp.mean(jnp.square(jax.lax.stop_gradient(output.images.lowlight) - target))
+    mse = _mean(squares, axis) / _mean(counted, axis)
+    report = StepReport(loss, terms, -10 * jnp.log10(mse), output.pairs, output.overflow, jnp.isfinite(loss))
+    return loss, (report, output.radii)
+
+
+def targets(
+    batch: Batch, estimate: Float[Array, "V H W 3"]
+) -> tuple[Float[Array, "V H W 3"], Float[Array, ""] | float]:
+    """What the low-light estimate is compared with, and the share of pixels that count.
+
+    Where pixels are not valid the estimate is compared with itself, held constant: nothing can be learned there.
+    """
+    if batch.valid is None:
+        return batch.images, 1.0
+    target = jnp.where(batch.valid[..., None], batch.images, jax.lax.stop_gradient(estimate))
+    return target, jnp.maximum(batch.valid.mean(dtype=target.dtype), 1e-6)
+
+
+def train_step(
+    state: TrainState,
+    batch: Batch,
+    config: Config,
+    *,
+    moving: bool,
+    pair_capacity: int,
+    at: Int[Array, ""] | int | None = None,
+    axis: str | None = None,
+) -> tuple[TrainState, StepReport]:
+    """One Adam step on one batch; a step that cannot be trusted leaves the state as it was and says so.
+
+    Args:
+        state: before the step.
+        batch: its views, or with `axis` this device's share of them, the same number on each.
+        config: settings; the numbers of `overrides.TRACED` may be traced.
+        moving: whether it is a step of the fine stage.
+        pair_capacity: size of the pair buffer for the views at hand.
+        at: the number of this step: a state that has not come that far, or is past it, is left as it was.
+        axis: of `jax.shard_map`, over which the views of the batch are spread. Gradients and statistics are those of
+            all views, and every device returns the same.
+    """
+    batch = jax.tree.map(lambda x: x if x.dtype == bool else x.astype(state.stats.seen.dtype), batch)
+
+    def value_and_grad(params: SceneParams) -> tuple:
+        probe = jnp.zeros((*batch.cameras.time.shape, state.scene.alive.shape[0], 2), batch.images.dtype)
+        (loss, (report, radii)), (gradient, probe_gradient) = jax.value_and_grad(objective, (0, 1), has_aux=True)(
+            params, probe, state, batch, config, moving, pair_capacity, axis
+        )
+        loss, gradient, moved = _mean((loss, gradient, probe_gradient.sum(0)), axis)
+        return (loss, (report._replace(loss=loss), _max(radii.max(0), axis), moved)), gradient
+
+    transformation = adam(state.scene.params, state.adam.schedules, config)
+    params, adam_state, (report, radii, moved), norm = optimizer.take_step(
+        value_and_grad, transformation, state.scene.params, state.adam
+    )
+
+    height, width = batch.images.shape[1:3]
+    report = report._replace(
+        terms=_mean(report.terms, axis),
+        pairs=_max(report.pairs, axis),
+        overflow=_max(report.overflow.astype(jnp.int32), axis) > 0,
+        finite=jnp.isfinite(report.loss) & jnp.isfinite(norm),
+    )
+    stepped = TrainState(
+        scene=state.scene._replace(params=params),
+        adam=adam_state,
+        stats=densification.accumulate(state.stats, moved, radii, width, height),
+        step=state.step + 1,
+    )
+    taken = report.finite & ~report.overflow
+    if at is not None:
+        taken &= state.step == at
+    return tree_where(taken, stepped, state), report
+
+
+def adam(params: SceneParams, rates: dict[str, optimizer.Schedule], config: Config) -> optimizer.Transformation:
+    """The optimizer of all of `params`."""
+    return optimizer.adam(groups(params), rates, config.optim.beta1, config.optim.beta2, config.optim.eps)
+
+
+def begin_stage(scene: Scene, step: Int[Array, ""], config: Config, stage_steps: int) -> TrainState:
+    """A state with fresh optimizer moments, schedules and statistics, as 4DGS starts each stage."""
+    rates = schedules(config.optim, scene.extent, stage_steps)
+    transformation = adam(scene.params, rates, config)
+    return TrainState(scene, transformation.init(scene.params), densification.empty_stats(scene.alive.shape[0]), step)
+
+
+def densify(state: TrainState, config: Config) -> tuple[TrainState, Int[Array, ""]]:
+    """Clone, split and prune; also the number of rows that this needs, to be called again with if there are fewer."""
+    scene = state.scene
+    key = jax.random.fold_in(jax.random.key(config.seed), state.step)
+    result = densification.densify(scene.params.gaussians, scene.alive, state.stats, scene.extent, key, config.density)
+    forget = lambda rows: jnp.where(result.changed.reshape(-1, *[1] * (rows.ndim - 1)), 0, rows)
+    moments = lambda tree: tree._replace(gaussians=jax.tree.map(forget, tree.gaussians))
+    grown = TrainState(
+        scene=scene._replace(params=scene.params._replace(gaussians=result.gaussians), alive=result.alive),
+        adam=state.adam._replace(mu=moments(state.adam.mu), nu=moments(state.adam.nu)),
+        stats=jax.tree.map(jnp.zeros_like, state.stats),
+        step=state.step,
+    )
+    return grown, jnp.where(result.missing > 0, scene.alive.sum() + result.wanted, 0)
+
+
+def with_capacity(state: TrainState, capacity: int) -> TrainState:
+    """The same state with dead rows appended up to `capacity`."""
+    grow = lambda tree: tree._replace(gaussians=jax.tree.map(lambda x: pad_rows(x, capacity), tree.gaussians))
+    return TrainState(
+        scene=state.scene._replace(params=grow(state.scene.params), alive=pad_rows(state.scene.alive, capacity)),
+        adam=state.adam._replace(mu=grow(state.adam.mu), nu=grow(state.adam.nu)),
+        stats=jax.tree.map(lambda x: pad_rows(x, capacity), state.stats),
+        step=state.step,
+    )
+
+
+def tree_where(condition: Bool[Array, ""], new: T, old: T) -> T:
+    """One tree or the other."""
+    return jax.tree.map(lambda new, old: jnp.where(condition, new, old), new, old)
+
+
+def _mean(tree: T, axis: str | None) -> T:
+    return tree if axis is None else jax.lax.pmean(tree, axis)
+
+
+def _max(x: Array, axis: str | None) -> Array:
+    return x if axis is None else jax.lax.pmax(x, axis)

@@ -1,0 +1,255 @@
+"""Scores of a run against plain NumPy and scikit-image, and the command that prints them."""
+
+import dataclasses
+import json
+import os
+import subprocess
+import sys
+
+import finished_run
+import numpy as np
+import pytest
+from skimage.metrics import structural_similarity
+
+from l2dgs_jax import runs
+from l2dgs_jax.cameras.geometry import select_camera
+from l2dgs_jax.data import load_dataset
+from l2dgs_jax.errors import UserError
+from l2dgs_jax.evaluate import evaluate, main, table
+from l2dgs_jax.runtime import command_line
+
+
+@pytest.fixture(autouse=True)
+def _no_compilation_cache(monkeypatch):
+    monkeypatch.setenv("L2DGS_JAX_CACHE", "off")
+
+
+@pytest.fixture(scope="module")
+def base(tmp_path_factory):
+    return tmp_path_factory.getbasetemp()
+
+
+@pytest.fixture(scope="module")
+def run(base):
+    return finished_run.opened(base)
+
+
+@pytest.fixture(scope="module")
+def result(run):
+    return evaluate(run)
+
+
+@pytest.fixture(scope="module")
+def rendered(run):
+    split, renderer = run.dataset.test, run.renderer()
+    outputs = [renderer(select_camera(split.cameras, i)).images for i in range(len(split.names))]
+    as_double = lambda images: np.stack(images).astype(np.float64)
+    return {
+        "lowlight": as_double([output.lowlight for output in outputs]),
+        "welllit": as_double([output.welllit for output in outputs]),
+        "input": as_double(split.images),
+        "truth": as_double(split.welllit),
+        "masks": split.masks,
+    }
+
+
+def psnr(prediction, truth, masks=None):
+    masks = np.ones(truth.shape[:-1], bool) if masks is None else masks
+    frames = zip(prediction, truth, masks, strict=True)
+    return np.mean([-10 * np.log10(np.mean((p[m] - t[m]) ** 2)) for p, t, m in frames if m.any()])
+
+
+def ssim(prediction, truth, masks=None):
+    """Of windows inside the image, or of all windows around the pixels of a mask."""
+    scores = []
+    for i, (p, t) in enumerate(zip(prediction, truth, strict=True)):
+        mean, similarity = structural_similarity(
+            p, t, gaussian_weights=True, use_sample_covariance=False, channel_axis=-1, data_range=1.0, full=True
+        )
+        if masks is None:
+            scores.append(mean)
+        elif masks[i].any():
+            scores.append(similarity[masks[i]].mean())
+    return np.mean(scores)
+
+
+def regions(masks):
+    return {"overall": None, "dynamic": masks, "static": ~masks}
+
+
+def best_gain(prediction, truth):
+    return np.linalg.lstsq(prediction.reshape(-1, 1), truth.ravel())[0].item()
+
+
+def test_counts(result, run):
+    assert result["frames"] == len(finished_run.HELD_OUT)
+    assert (result["split"], result["stage"], result["step"]) == ("test", "fine", 6)
+    assert result["gaussians"] == int(np.sum(run.state.scene.alive))
+    assert json.loads(json.dumps(result)) == result
+
+
+def test_frames_in_a_file_score_the_same(run, result):
+    scene, _ = runs.read_settings(run.folder)
+    assert evaluate(dataclasses.replace(run, dataset=load_dataset(scene, frame_memory=0.0))) == result
+
+
+def test_lowlight_scores_are_scikit_images(result, rendered):
+    for region, masks in regions(rendered["masks"]).items():
+        scores = result["lowlight"] if region == "overall" else result["lowlight_regions"][region]
+        assert set(scores) == {"psnr", "ssim"}
+        np.testing.assert_allclose(scores["psnr"], psnr(rendered["lowlight"], rendered["input"], masks), atol=1e-3)
+        np.testing.assert_allclose(scores["ssim"], ssim(rendered["lowlight"], rendered["input"], masks), atol=1e-3)
+    np.testing.assert_allclose(result["mask_area"], rendered["masks"].mean())
+
+
+def test_welllit_scores_are_scikit_images(result, rendered):
+    gain = best_gain(rendered["welllit"], rendered["truth"])
+    np.testing.assert_allclose(result["gain"], gain, rtol=1e-3)
+    gained = np.clip(gain * rendered["welllit"], 0, 1)
+    assert set(result["welllit"]) == {"overall", "dynamic", "static"}
+    for region, masks in regions(rendered["masks"]).items():
+        for suffix, prediction in (("", rendered["welllit"]), ("_gain", gained)):
+            scores = {key: result["welllit"][region][key + suffix] for key in ("psnr", "ssim")}
+            np.testing.assert_allclose(scores["psnr"], psnr(prediction, rendered["truth"], masks), atol=1e-2)
+            np.testing.assert_allclose(scores["ssim"], ssim(prediction, rendered["truth"], masks), atol=1e-3)
+    assert result["welllit"]["overall"]["psnr_gain"] >= result["welllit"]["overall"]["psnr"] - 0.1
+
+
+def test_dark_frame_times_its_best_gain(result, rendered):
+    gain = best_gain(rendered["input"], rendered["truth"])
+    assert gain > 3
+    gained = np.clip(gain * rendered["input"], 0, 1)
+    reference = result["dark_frame_gain"]
+    np.testing.assert_allclose(reference["gain"], gain, rtol=1e-4)
+    np.testing.assert_allclose(reference["psnr_gain"], psnr(gained, rendered["truth"]), atol=1e-3)
+    np.testing.assert_allclose(reference["ssim_gain"], ssim(gained, rendered["truth"]), atol=1e-3)
+
+
+def test_without_truth_or_masks_only_the_low_light_is_scored(run):
+    bare = finished_run.without_truth_and_test(run)
+    result = evaluate(bare, "train")
+    assert not {"welllit", "gain", "dark_frame_gain", "lowlight_regions", "mask_area"} & set(result)
+    assert result["frames"] == len(run.dataset.train.names)
+    with_masks = dataclasses.replace(bare.dataset, train=dataclasses.replace(run.dataset.train, welllit=None))
+    result = evaluate(dataclasses.replace(bare, dataset=with_masks), "train")
+    assert set(result["lowlight_regions"]) == {"dynamic", "static"}
+    assert "welllit" not in result
+
+
+def test_split_without_views(run):
+    with pytest.raises(UserError, match="has no test views; expected some, or --split train"):
+        evaluate(finished_run.without_truth_and_test(run))
+
+
+def test_table_shows_every_score(result):
+    lines = table(result).splitlines()
+    assert lines[0] == "2 test views, fine stage, step 6"
+    overall = next(line for line in lines if line.startswith("well-lit")).split()[1:]
+    scores = result["welllit"]["overall"]
+    assert overall == [
+        f"{scores['psnr']:.2f}",
+        f"{scores['ssim']:.3f}",
+        f"{scores['psnr_gain']:.2f}",
+        f"{scores['ssim_gain']:.3f}",
+    ]
+    dark = next(line for line in lines if line.startswith("dark frame"))
+    header = lines[1]
+    assert dark.index(f"{result['dark_frame_gain']['psnr_gain']:.2f}") > header.index("SSIM")
+    assert sum(line.startswith("  dynamic") for line in lines) == 2
+
+
+def test_command_writes_what_evaluate_returns(base, result, tmp_path, capsys):
+    file = tmp_path / "scores.json"
+    file.write_text("old")
+    command_line.run(main, [str(finished_run.folder(base)), "--json", str(file)])
+    assert json.loads(file.read_text()) == result
+    assert [p.name for p in tmp_path.iterdir()] == ["scores.json"]
+    assert capsys.readouterr().out.strip() == table(result)
+
+
+def test_command_scores_the_coarse_stage_and_the_training_views(base, result, tmp_path, capsys):
+    run_folder = str(finished_run.folder(base))
+    command_line.run(
+        main, [run_folder, "--stage", "coarse", "--split", "train", "--json", str(tmp_path / "coarse.json")]
+    )
+    coarse = json.loads((tmp_path / "coarse.json").read_text())
+    assert (coarse["stage"], coarse["step"], coarse["split"]) == ("coarse", 3, "train")
+    assert coarse["frames"] == finished_run.FRAMES - len(finished_run.HELD_OUT)
+    assert coarse["lowlight"] != result["lowlight"]
+    assert "8 train views, coarse stage, step 3" in capsys.readouterr().out
+
+
+def test_a_process_of_its_own_in_single_precision_finds_the_same(base, result, tmp_path):
+    file = tmp_path / "scores.json"
+    command = [sys.executable, "-m", "l2dgs_jax.evaluate", str(finished_run.folder(base)), "--json", str(file)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, env=os.environ | {"JAX_ENABLE_X64": "0"})
+    assert done.stdout.startswith("2 test views")
+    single = json.loads(file.read_text())
+    for scores, expected in (
+        (single["lowlight"], result["lowlight"]),
+        (single["welllit"]["overall"], result["welllit"]["overall"]),
+    ):
+        assert scores == pytest.approx(expected, abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["{missing}"], "missing: not a training run; expected a folder with config.json"),
+        (["{empty}"], "empty: not a training run; expected a folder with config.json"),
+        (
+            ["{run}", "--json", "{missing}/scores.json"],
+            "scores.json: cannot be written; expected a file in an existing",
+        ),
+        (["{run}", "--json", "{empty}"], "empty: cannot be written; expected a file in an existing folder"),
+    ],
+)
+def test_bad_input_is_one_sentence_and_exit_code_2(base, tmp_path, capsys, arguments, message):
+    (tmp_path / "empty").mkdir()
+    places = {"missing": tmp_path / "missing", "empty": tmp_path / "empty", "run": finished_run.folder(base)}
+    with pytest.raises(SystemExit) as leave:
+        command_line.run(main, [argument.format(**places) for argument in arguments])
+    assert leave.value.code == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert len(error.strip().splitlines()) == 1
+
+
+def test_run_without_a_coarse_checkpoint(base, tmp_path, capsys):
+    scene, config = runs.read_settings(finished_run.folder(base))
+    runs.write_settings(tmp_path / "young", scene, config)
+    with pytest.raises(SystemExit) as leave:
+        command_line.run(main, [str(tmp_path / "young"), "--stage", "coarse"])
+    assert leave.value.code == 2
+    assert "coarse.npz: no such checkpoint; expected a run that has got that far" in capsys.readouterr().err
+
+
+def test_pixels_that_do_not_count_are_left_out_and_covisible_ones_scored(run, result, rendered):
+    split = run.dataset.test
+    rng = np.random.default_rng(0)
+    valid, seen = (rng.random(split.masks.shape) < share for share in (0.8, 0.5))
+    results = []
+    for wrong in (0, 1):
+        spoil = lambda images, wrong=wrong: np.where(valid[..., None], images, wrong).astype(np.float16)
+        test = dataclasses.replace(
+            split, images=spoil(split.images), welllit=spoil(split.welllit), valid=valid, covisible=seen
+        )
+        results.append(evaluate(dataclasses.replace(run, dataset=dataclasses.replace(run.dataset, test=test))))
+    assert results[0] == results[1]
+    found = results[0]
+    assert found["lowlight_regions"].keys() == {"dynamic", "static", "covisible"}
+    assert found["welllit"].keys() == {"overall", "dynamic", "static", "covisible"}
+    for region, masks in (("covisible", valid & seen), ("static", valid & ~split.masks)):
+        expected = psnr(rendered["lowlight"], rendered["input"], masks)
+        np.testing.assert_allclose(found["lowlight_regions"][region]["psnr"], expected, atol=1e-4)
+    np.testing.assert_allclose(
+        found["lowlight"]["psnr"], psnr(rendered["lowlight"], rendered["input"], valid), atol=1e-4
+    )
+    assert "covisible" in table(found)
+    assert "covisible" not in table(result)
+
+
+def test_a_split_in_which_no_pixel_counts_is_refused(run):
+    test = dataclasses.replace(run.dataset.test, valid=np.zeros(run.dataset.test.masks.shape, bool))
+    with pytest.raises(UserError, match="no pixel of its scene's test views is valid; expected"):
+        evaluate(dataclasses.replace(run, dataset=dataclasses.replace(run.dataset, test=test)))

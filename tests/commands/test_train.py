@@ -1,0 +1,221 @@
+"""`python -m l2dgs_jax.train` as a user meets it: a whole run, a killed one, and every mistake."""
+
+import dataclasses
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import cv2
+import numpy as np
+import pytest
+from scenes import edit_json, write_nerfies
+
+from l2dgs_jax import runs, train
+from l2dgs_jax.config import PRESETS
+from l2dgs_jax.data import load_dataset
+from l2dgs_jax.errors import UserError
+from l2dgs_jax.runs import checkpoints
+from l2dgs_jax.runtime import command_line
+from l2dgs_jax.training import engine
+
+TINY = [
+    "--coarse-steps=6",
+    "--fine-steps=6",
+    "--checkpoint-every=2",
+    "--model.plane-size=4",
+    "--model.plane-scales=1",
+    "--model.hidden=8",
+    "--density.start=1",
+    "--density.interval=4",
+    "--density.grad-threshold=1e-7",
+    "--density.max-gaussians=80",
+]
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    return write_nerfies(tmp_path_factory.mktemp("scene") / "blobs", 10, 24, 18, num_points=40)
+
+
+@pytest.fixture(scope="module")
+def environment(tmp_path_factory):
+    return os.environ | {"L2DGS_JAX_CACHE": str(tmp_path_factory.mktemp("cache")), "PYTHONWARNINGS": "ignore"}
+
+
+def command(*arguments):
+    return [sys.executable, "-m", "l2dgs_jax.train", *map(str, arguments)]
+
+
+@pytest.fixture(scope="module")
+def finished(scene, environment, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("finished") / "run"
+    done = subprocess.run(
+        command(scene, "--output", folder, *TINY), env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    return folder, done
+
+
+def read_state(folder, scene):
+    _, config = runs.read_settings(folder)
+    return checkpoints.load(folder / runs.CHECKPOINT, config, len(load_dataset(scene).train.names)).state
+
+
+def test_a_run_leaves_what_it_promises(finished):
+    folder, done = finished
+    metrics = [json.loads(line) for line in (folder / runs.METRICS).read_text().splitlines()]
+    assert metrics[-1]["step"] == 12
+    assert metrics[-1]["stage"] == "fine"
+    assert np.isfinite([metrics[-1]["loss"], metrics[-1]["psnr"]]).all()
+    assert cv2.imread(str(folder / runs.CONTACT_SHEET)).std() > 1
+    assert cv2.VideoCapture(str(folder / runs.VIDEO)).get(cv2.CAP_PROP_FRAME_COUNT) > 24
+    assert (folder / runs.COARSE).exists()
+    assert not list(folder.glob("*.tmp*"))
+    assert "12/12" in done.stderr
+    assert "low-light" in done.stderr
+    assert "Gaussians" in done.stderr
+
+
+def test_a_killed_run_resumes_to_the_same_result(scene, environment, finished, tmp_path):
+    folder = tmp_path / "run"
+    arguments = command(scene, "--output", folder, *TINY)
+    with subprocess.Popen(arguments, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
+        while process.poll() is None and not (folder / runs.CHECKPOINT).exists():
+            time.sleep(0.02)
+        process.send_signal(signal.SIGKILL)
+    lost = int(read_state(folder, scene).step)
+    assert 2 <= lost <= 12
+    resumed = subprocess.run(
+        command(scene, "--output", folder, "--resume"), env=environment, capture_output=True, text=True, check=False
+    )
+    assert resumed.returncode == 0, resumed.stderr
+    state, expected = read_state(folder, scene), read_state(finished[0], scene)
+    assert int(state.step) == 12
+    for a, b in zip(state.scene.params.gaussians, expected.scene.params.gaussians, strict=True):
+        np.testing.assert_array_equal(a, b)
+    steps = [json.loads(line)["step"] for line in (folder / runs.METRICS).read_text().splitlines()]
+    assert steps == sorted(set(steps))
+
+
+@pytest.fixture
+def refuses(monkeypatch, capsys):
+    """Asserts that a command line ends in one sentence and exit code 2, before anything is compiled."""
+
+    def compiled(*_, **__):
+        raise AssertionError("reached the first compilation")
+
+    monkeypatch.setattr(engine, "train_steps", compiled)
+    monkeypatch.setattr(command_line, "use_compilation_cache", lambda: None)
+
+    def check(*arguments, naming):
+        with pytest.raises(SystemExit) as caught:
+            command_line.run(train.main, list(map(str, arguments)))
+        assert caught.value.code == 2
+        message = capsys.readouterr().err
+        assert message.startswith("error: ")
+        assert message.count("\n") == 1
+        for part in (*naming, "expected"):
+            assert part in message, message
+
+    return check
+
+
+@pytest.fixture
+def damaged(tmp_path):
+    return write_nerfies(tmp_path / "damaged", 8, 24, 18, num_points=12)
+
+
+def test_missing_scene(refuses, tmp_path):
+    refuses(tmp_path / "nonsuch", "--output", tmp_path / "run", naming=["nonsuch"])
+    assert not (tmp_path / "run").exists()
+
+
+def test_empty_folder(refuses, tmp_path):
+    (tmp_path / "empty").mkdir()
+    refuses(tmp_path / "empty", "--output", tmp_path / "run", naming=["empty"])
+
+
+def test_damaged_image_leaves_no_run(refuses, damaged, tmp_path):
+    image = next((damaged / "rgb" / "1x").iterdir())
+    image.write_bytes(b"not a picture")
+    refuses(damaged, "--output", tmp_path / "run", naming=[image.name])
+    assert not (tmp_path / "run").exists()
+
+
+def test_nan_in_a_pose(refuses, damaged, tmp_path):
+    camera = sorted((damaged / "camera").iterdir())[2]
+    edit_json(camera, position=[0.0, float("nan"), 0.0])
+    refuses(damaged, "--output", tmp_path / "run", naming=[camera.name])
+
+
+def test_unknown_preset(refuses, scene, tmp_path):
+    refuses(scene, "--preset", "nonsuch", "--output", tmp_path / "run", naming=["nonsuch", "default", "paper"])
+
+
+def test_no_steps(refuses, scene, tmp_path):
+    refuses(scene, "--coarse-steps=0", "--fine-steps=0", "--output", tmp_path / "run", naming=["--coarse-steps"])
+
+
+def test_output_that_holds_another_run(refuses, scene, finished):
+    refuses(scene, "--output", finished[0], naming=[str(finished[0]), "--resume"])
+
+
+def test_output_that_is_a_file(refuses, scene, tmp_path):
+    (tmp_path / "file").write_text("")
+    refuses(scene, "--output", tmp_path / "file", naming=["file"])
+
+
+def test_output_that_cannot_be_made(refuses, scene, tmp_path):
+    (tmp_path / "file").write_text("")
+    refuses(scene, "--output", tmp_path / "file" / "run", naming=["file/run"])
+
+
+def test_resume_without_a_run(refuses, scene, tmp_path):
+    refuses(scene, "--output", tmp_path / "nonsuch", "--resume", naming=["nonsuch"])
+
+
+def test_resume_with_other_settings(refuses, scene, finished):
+    refuses(
+        scene,
+        "--output",
+        finished[0],
+        "--resume",
+        "--optim.reflectance-lr=0.5",
+        naming=["checkpoint.npz", "optim.reflectance_lr"],
+    )
+
+
+def test_resume_from_a_truncated_checkpoint(refuses, scene, finished, tmp_path):
+    (tmp_path / runs.SETTINGS).write_bytes((finished[0] / runs.SETTINGS).read_bytes())
+    (tmp_path / runs.CHECKPOINT).write_bytes((finished[0] / runs.CHECKPOINT).read_bytes()[:1000])
+    refuses(scene, "--output", tmp_path, "--resume", naming=["checkpoint.npz", "truncated"])
+
+
+def test_an_unknown_option_is_refused(capsys, scene):
+    with pytest.raises(SystemExit) as caught:
+        command_line.run(train.main, [str(scene), "--nonsuch=1"])
+    assert caught.value.code == 2
+    assert "nonsuch" in capsys.readouterr().err
+
+
+def test_a_layout_that_the_scene_does_not_have(refuses, scene, tmp_path):
+    refuses(scene, "--format=llff", "--output", tmp_path / "run", naming=["poses_bounds.npy"])
+    refuses(scene, "--held-out=every", "--output", tmp_path / "run", naming=["--held-out every", "4dgs"])
+
+
+def test_layout_and_held_out_views_stay_those_of_the_run(scene, tmp_path, monkeypatch):
+    config = dataclasses.replace(PRESETS["demo"], format="nerfies", held_out="5", downscale=2, frame_memory=0.5)
+    runs.write_settings(tmp_path, str(scene), config)
+    assert train._parse([str(scene), "--output", str(tmp_path), "--resume"]).config == config
+
+    def stop(*arguments):
+        raise UserError(repr(arguments))
+
+    monkeypatch.setattr(sys.modules["l2dgs_jax.runs.folder"], "load_dataset", stop)
+    (tmp_path / runs.CHECKPOINT).write_bytes(b"")
+    with pytest.raises(UserError) as caught:
+        runs.open_run(tmp_path)
+    assert str(caught.value) == repr((str(scene), 2, "nerfies", "5", 0.5))

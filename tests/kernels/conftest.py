@@ -1,0 +1,1 @@
+from forms import any_form  # noqa: F401

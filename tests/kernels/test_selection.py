@@ -1,0 +1,100 @@
+"""Which form runs: the setting, else the platform that a program is lowered for."""
+
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from l2dgs_jax.kernels import selection, use_kernels
+from l2dgs_jax.kernels.selection import by_form
+
+
+def add(x, y):
+    """Adds another number in each form."""
+    return by_form(
+        x,
+        y,
+        reference=lambda x, y: {"sum": x + y["a"] + 1},
+        cpu=lambda x, y: {"sum": x + y["a"] + 2},
+        accelerator=lambda x, y: {"sum": x + y["a"] + 4},
+        like={"sum": x},
+    )["sum"]
+
+
+X = jnp.arange(3.0)
+Y = {"a": jnp.ones(3)}
+
+
+def test_the_setting_decides_also_about_what_was_compiled_before():
+    compiled = jax.jit(add)
+    for form, constant in (("reference", 1), ("cpu", 2), ("accelerator", 4), (None, 2), ("reference", 1)):
+        with use_kernels(form):
+            np.testing.assert_array_equal(compiled(X, Y), X + 1 + constant)
+            np.testing.assert_array_equal(add(X, Y), X + 1 + constant)
+    with use_kernels("accelerator"), use_kernels(None):
+        np.testing.assert_array_equal(compiled(X, Y), X + 3)
+
+
+@pytest.mark.parametrize("platform", ["cpu", "cuda", "rocm", "tpu"])
+def test_without_a_setting_the_platform_lowered_for_decides(platform):
+    text = jax.jit(add).trace(X, Y).lower(lowering_platforms=(platform,)).as_text()
+    constants = {number for number in ("1", "2", "4") if f"dense<{number}.000000e+00>" in text}
+    assert constants == {"2" if platform == "cpu" else "4"}
+
+
+def test_one_program_for_two_platforms_holds_both():
+    text = jax.jit(add).trace(X, Y).lower(lowering_platforms=("cpu", "cuda")).as_text()
+    assert "dense<2.000000e+00>" in text
+    assert "dense<4.000000e+00>" in text
+
+
+def test_only_what_is_needed_is_traced():
+    def fail(x):
+        raise AssertionError
+
+    f = lambda x: by_form(x, reference=fail, cpu=jnp.sin, accelerator=fail, like=x)
+    np.testing.assert_array_equal(jax.jit(f)(X), jnp.sin(X))
+
+
+def test_batches_in_any_axis_and_shared_arguments():
+    x = jnp.arange(6.0).reshape(3, 2)
+    np.testing.assert_array_equal(jax.jit(jax.vmap(add, (1, None), 1))(x, Y), x + 3)
+    twice = jax.vmap(jax.vmap(add, (0, None)), (None, 0))(X, {"a": x})
+    np.testing.assert_array_equal(twice, np.asarray(X)[None, :, None] + np.asarray(x)[:, None] + 2)
+
+
+def test_an_untried_compiler_gets_the_general_form_and_says_so_once(monkeypatch):
+    monkeypatch.setattr(selection, "TRIED", False)
+    selection._warn_of_untried_compiler.cache_clear()
+    with pytest.warns(RuntimeWarning, match=r"jaxlib .* was not tried .*; expected jaxlib 0\.10"):
+        np.testing.assert_array_equal(jax.jit(lambda x: add(x, Y))(X), X + 5)
+    # Warnings are errors here: a second one would fail.
+    np.testing.assert_array_equal(jax.jit(lambda x: add(x + 0, Y))(X), X + 5)
+
+
+def test_another_form_is_refused():
+    with pytest.raises(ValueError, match="expected one of reference, cpu, accelerator, or None"):
+        use_kernels("gpu")
+
+
+@pytest.mark.parametrize(("value", "constant"), [("accelerator", 4), ("", 2)])
+def test_the_environment_sets_the_form_of_a_process(value, constant):
+    program = (
+        "import jax.numpy as jnp; from l2dgs_jax.kernels.selection import by_form;"
+        "f = lambda k: lambda x: x + k;"
+        "print(by_form(jnp.zeros(()), reference=f(1), cpu=f(2), accelerator=f(4), like=jnp.zeros(())))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], env={"PATH": "", selection.VARIABLE: value}, capture_output=True, text=True
+    )
+    assert float(done.stdout) == constant, done.stderr
+
+
+def test_a_misspelt_environment_is_an_error():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(selection.VARIABLE, "fast")
+        with pytest.raises(ValueError, match="L2DGS_JAX_KERNELS is 'fast'; expected one of"):
+            selection._from_environment()

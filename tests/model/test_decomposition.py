@@ -1,0 +1,136 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.test_util import check_grads
+
+from l2dgs_jax.model.decomposition import clip_unit, decompose, power
+from l2dgs_jax.model.networks import apply_bafe
+from l2dgs_jax.types import BAFENet, Conv, GroupNorm
+
+decompose_jit = jax.jit(decompose)
+
+
+def make_bafe(dtype=jnp.float64):
+    rng = np.random.default_rng(0)
+
+    def conv(size, inputs, outputs):
+        weight = rng.normal(0, (size * size * inputs) ** -0.5, (size, size, inputs, outputs))
+        return Conv(jnp.asarray(weight, dtype), jnp.asarray(rng.normal(0, 0.1, outputs), dtype))
+
+    def norm(channels):
+        return GroupNorm(jnp.ones(channels, dtype), jnp.zeros(channels, dtype))
+
+    return BAFENet(conv(5, 2, 8), norm(8), conv(3, 8, 16), norm(16), conv(3, 16, 8), norm(8), conv(1, 8, 2))
+
+
+def make_features(*shape, low=0.1, high=0.9, dtype=jnp.float64):
+    return jnp.asarray(np.random.default_rng(1).uniform(low, high, (*shape, 6)), dtype)
+
+
+@jax.jit
+def gradients(features, bafe):
+    """Of the sum of all images."""
+
+    def objective(features, bafe):
+        return sum(image.sum() for image in decompose(features, bafe))
+
+    return jax.grad(objective, (0, 1))(features, bafe)
+
+
+def all_finite(tree):
+    return all(jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(tree))
+
+
+def test_images_follow_eqs_5_to_9():
+    features, bafe = make_features(2, 4, 5, low=-0.5, high=1.5), make_bafe()
+    images = jax.tree.map(np.asarray, decompose_jit(features, bafe))
+    exponents = np.asarray(apply_bafe(bafe, features[..., 4:]))
+    for index in np.ndindex(2, 4, 5):
+        illumination = min(max(float(features[index][0]), 0.0), 1.0)
+        np.testing.assert_allclose(images.illumination[index], illumination, rtol=1e-12)
+        np.testing.assert_allclose(images.attenuation[index], exponents[index], rtol=1e-9)
+        b1, b2 = exponents[index]
+        for channel in range(3):
+            reflectance = min(max(float(features[index][1 + channel]), 0.0), 1.0)
+            pixel = (*index, channel)
+            np.testing.assert_allclose(images.reflectance[pixel], reflectance, rtol=1e-12)
+            np.testing.assert_allclose(images.welllit[pixel], illumination * reflectance, rtol=1e-12)
+            np.testing.assert_allclose(images.lowlight[pixel], illumination**b2 * reflectance**b1, rtol=1e-9)
+
+
+def test_the_low_light_image_is_never_brighter():
+    images = decompose_jit(make_features(2, 4, 5, low=-0.5, high=1.5), make_bafe())
+    assert (images.lowlight <= images.welllit).all()
+    assert (images.attenuation > 1).all()
+    assert (images.attenuation < 10).all()
+
+
+def test_gradients_of_the_images():
+    features, bafe = make_features(2, 4, 5), make_bafe()
+    check_grads(jax.jit(decompose), (features, bafe), 1, ("rev",), 1e-5, 1e-5, eps=1e-6)
+
+
+def test_gradients_of_power():
+    base = jnp.asarray(np.random.default_rng(2).uniform(0.05, 1, (3, 4)))
+    exponent = 1 + 9 * jnp.asarray(np.random.default_rng(3).uniform(size=(3, 4)))
+    check_grads(jax.jit(power), (base, exponent), 1, ("fwd", "rev"), 1e-5, 1e-5, eps=1e-6)
+    check_grads(jax.jit(power), (base, exponent[:, :1]), 1, ("fwd", "rev"), 1e-5, 1e-5, eps=1e-6)
+    check_grads(jax.jit(power), (base, exponent[0, 0]), 1, ("fwd", "rev"), 1e-5, 1e-5, eps=1e-6)
+
+
+power_gradients = jax.jit(jax.grad(lambda base, exponent: power(base, exponent).sum(), (0, 1)))
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_power_near_zero(dtype):
+    smallest = float(jnp.finfo(dtype).smallest_subnormal)
+    base = jnp.asarray([0.0, smallest, 0.5 * float(jnp.finfo(dtype).tiny), float(jnp.finfo(dtype).tiny), 1e-30], dtype)
+    for exponent in (1.0, 1.5, 10.0):
+        exponents = jnp.full_like(base, exponent)
+        values = power(base, exponents)
+        slopes = power_gradients(base, exponents)
+        np.testing.assert_allclose(values, np.asarray(base) ** exponent, atol=1e-12)
+        assert all_finite(slopes)
+        assert slopes[1][0] == 0
+        assert slopes[0][0] == 0
+
+
+def test_clipping_is_live_on_its_bounds_and_dead_outside():
+    x = jnp.asarray([-1e30, -1e-9, 0.0, 0.5, 1.0, 1 + 1e-9, 1e30])
+    np.testing.assert_array_equal(clip_unit(x), [0, 0, 0, 0.5, 1, 1, 1])
+    np.testing.assert_array_equal(jax.vmap(jax.grad(clip_unit))(x), [0, 0, 1, 1, 1, 0, 0])
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+@pytest.mark.parametrize("level", [0.0, 1.0, -3.0, 3.0, 1e-38, 1e30, -1e30])
+def test_flat_features_stay_finite(level, dtype):
+    features, bafe = jnp.full((2, 4, 5, 6), level, dtype), make_bafe(dtype)
+    for image in decompose_jit(features, bafe):
+        assert image.dtype == dtype
+        assert jnp.isfinite(image).all()
+    assert all_finite(gradients(features, bafe))
+
+
+@pytest.mark.parametrize("channels", [slice(0, 1), slice(1, 4)], ids=["black L", "black R"])
+def test_one_black_factor_blackens_both_images(channels):
+    features = make_features(2, 4, 5).at[..., channels].set(0.0)
+    images = decompose_jit(features, make_bafe())
+    assert not images.welllit.any()
+    assert not images.lowlight.any()
+    assert all_finite(gradients(features, make_bafe()))
+
+
+def test_one_pixel():
+    features = make_features(1, 1, 1)
+    assert all_finite(decompose_jit(features, make_bafe()))
+    assert all_finite(gradients(features, make_bafe()))
+
+
+def test_batches_are_independent_views():
+    features, bafe = make_features(2, 4, 5), make_bafe()
+    together = decompose_jit(features, bafe)
+    for index in range(2):
+        alone = decompose_jit(features[index], bafe)
+        for a, b in zip(together, alone, strict=True):
+            np.testing.assert_allclose(a[index], b, rtol=1e-9)

@@ -1,0 +1,222 @@
+"""Moving and lighting the Gaussians: Eqs. 1-4 composed, dead rows, gradients."""
+
+import dataclasses
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.test_util import check_grads
+
+from l2dgs_jax.config import ModelConfig
+from l2dgs_jax.model import hexplane, networks
+from l2dgs_jax.model.deformation import deform
+from l2dgs_jax.types import Camera, Gaussians, SceneParams
+
+CFG = ModelConfig(
+    plane_size=3, plane_scales=(1, 2), plane_channels=2, time_size=3, hidden=5, sh_degree=2, opacity_head=True
+)
+BOUNDS = jnp.asarray(np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))
+N = 6
+
+run = jax.jit(deform, static_argnames=("cfg", "moving"))
+
+
+@partial(jax.jit, static_argnums=2)
+def field_and_motion(params, times, cfg):
+    field = hexplane.features(params.hexplane, params.gaussians.means, BOUNDS, times, cfg)
+    hidden, motion = networks.apply_heads(params.heads, field)
+    return motion, networks.apply_ocd(params.ocd, hidden)
+
+
+def initial(key):
+    """The start of everything but the Gaussians."""
+    return (
+        hexplane.init(key, CFG, 9),
+        networks.init_heads(key, 4, CFG),
+        networks.init_ocd(key, CFG),
+        networks.init_bafe(key, None),
+    )
+
+
+def scene(seed=0):
+    rng = np.random.default_rng(seed)
+    draw = lambda *shape: jnp.asarray(rng.normal(0.1, 0.4, shape))
+    gaussians = Gaussians(
+        means=jnp.asarray(rng.uniform(-0.9, 0.9, (N, 3))),
+        quats=draw(N, 4),
+        log_scales=draw(N, 3),
+        logit_opacities=draw(N),
+        illumination_dc=draw(N, 1),
+        illumination_rest=draw(N, 8),
+        reflectance=draw(N, 3),
+        attenuation=draw(N, 2),
+    )
+    shared = jax.tree.map(lambda leaf: draw(*leaf.shape), jax.eval_shape(initial, jax.random.key(0)))
+    params = SceneParams(gaussians, *shared)
+    # Most factors a_j then lie on the live side of the ReLU.
+    out = params.ocd.out._replace(bias=jnp.ones(9))
+    return params._replace(ocd=params.ocd._replace(out=out))
+
+
+def look(seed=3, times=(0.2, 0.7)):
+    rng = np.random.default_rng(seed)
+    viewmat = np.tile(np.eye(4), (len(times), 1, 1))
+    for pose in viewmat:
+        pose[:3, :3] = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        pose[:3, 3] = rng.normal(0, 3, 3)
+    return Camera(jnp.asarray(viewmat), jnp.asarray(np.tile(np.eye(3), (len(times), 1, 1))), jnp.asarray(times))
+
+
+ALIVE = jnp.ones(N, bool)
+moved_at = partial(run, alive=ALIVE, bounds=BOUNDS, cfg=CFG, sh_degree_active=2)
+
+
+@partial(jax.jit, static_argnames="moving")
+@partial(jax.grad, has_aux=True)
+def gradient_of_visible(params, alive, moving):
+    """As a rasterizer does: nothing of an invisible Gaussian counts."""
+    moved = moved_at(params, alive=alive, cameras=look(), moving=moving)
+    seen = jax.tree.map(lambda x: jnp.where(alive.reshape(1, -1, *[1] * (x.ndim - 2)), x, 0).sum(), moved)
+    return sum(seen), moved
+
+
+def plain_basis(v):
+    """The first nine real spherical harmonics, from a table."""
+    x, y, z = v
+    return np.array(
+        [
+            np.sqrt(1 / np.pi) / 2,
+            *np.sqrt(3 / np.pi) / 2 * np.array([-y, z, -x]),
+            *np.sqrt(15 / np.pi) / 2 * np.array([x * y, -y * z]),
+            np.sqrt(5 / np.pi) / 4 * (3 * z * z - 1),
+            *np.sqrt(15 / np.pi) / 2 * np.array([-x * z, (x * x - y * y) / 2]),
+        ]
+    )
+
+
+@pytest.mark.parametrize("moving", [False, True])
+@pytest.mark.parametrize("active", [0, 1, 2])
+def test_illumination_is_equation_3(moving, active):
+    params, cameras = scene(), look()
+    actual = moved_at(params, cameras=cameras, moving=moving, sh_degree_active=jnp.array(active)).illumination
+    _, factors = field_and_motion(params, cameras.time, CFG)
+    factors, gaussians = jax.tree.map(np.asarray, (factors, params.gaussians))
+    expected = np.zeros((2, N))
+    for view, pose in enumerate(np.asarray(cameras.viewmat)):
+        centre = np.linalg.inv(pose)[:3, 3]
+        for i, mean in enumerate(gaussians.means):
+            direction = (mean - centre) / np.linalg.norm(mean - centre)
+            b = np.concatenate([gaussians.illumination_dc[i], gaussians.illumination_rest[i]])
+            a = factors[view, i] if moving else np.ones(9)
+            terms = (a * b * plain_basis(direction))[: (active + 1) ** 2]
+            expected[view, i] = max(0.5 + terms.sum(), 0)
+    np.testing.assert_allclose(actual, expected, rtol=1e-9, atol=1e-12)
+    assert (expected > 0).any()
+
+
+def test_illumination_offset_and_floor():
+    params = scene()
+    dark = params._replace(gaussians=params.gaussians._replace(illumination_dc=jnp.full((N, 1), -50.0)))
+    lit = lambda p, offset: (
+        moved_at(p, cameras=look(), cfg=dataclasses.replace(CFG, illumination_offset=offset), moving=False).illumination
+    )
+    np.testing.assert_array_equal(lit(dark, 0.5), 0)
+    np.testing.assert_allclose(lit(params, 5.0) - lit(params, 4.0), 1, rtol=1e-12)
+
+
+def test_coarse_stage_is_the_canonical_scene_in_every_view():
+    params = scene()
+    g, moved = params.gaussians, moved_at(params, cameras=look(), moving=False)
+    expected = {
+        "means": g.means,
+        "quats": g.quats,
+        "scales": np.exp(g.log_scales),
+        "opacities": 1 / (1 + np.exp(-g.logit_opacities)),
+        "reflectance": g.reflectance,
+        "attenuation": g.attenuation,
+    }
+    for name, value in expected.items():
+        np.testing.assert_allclose(getattr(moved, name), np.stack([value, value]), rtol=1e-14, err_msg=name)
+
+
+def test_fine_stage_adds_the_heads_to_the_raw_parameters():
+    params, cameras = scene(), look()
+    g, moved = params.gaussians, moved_at(params, cameras=cameras, moving=True)
+    motion, _ = field_and_motion(params, cameras.time, CFG)
+    g, motion = jax.tree.map(np.asarray, (g, motion))
+    np.testing.assert_allclose(moved.means, g.means[None] + motion.means, rtol=1e-12)
+    np.testing.assert_allclose(moved.quats, g.quats[None] + motion.quats, rtol=1e-12)
+    np.testing.assert_allclose(moved.scales, np.exp(g.log_scales[None] + motion.log_scales), rtol=1e-12)
+    logits = g.logit_opacities[None] + motion.logit_opacities
+    np.testing.assert_allclose(moved.opacities, 1 / (1 + np.exp(-logits)), rtol=1e-12)
+    assert np.abs(moved.means[0] - moved.means[1]).max() > 1e-3
+    still = moved_at(params, cameras=cameras, moving=False)
+    for name in ("reflectance", "attenuation"):
+        np.testing.assert_array_equal(getattr(moved, name), getattr(still, name))
+
+
+def test_without_its_head_the_opacity_does_not_depend_on_time():
+    params = scene()
+    params = params._replace(heads=params.heads._replace(opacity=None))
+    moving, still = (moved_at(params, cameras=look(), moving=moving) for moving in (True, False))
+    np.testing.assert_array_equal(moving.opacities, still.opacities)
+    assert np.any(moving.means != still.means)
+
+
+def test_identity_start_makes_the_first_fine_step_equal_to_the_last_coarse_one():
+    cfg = dataclasses.replace(CFG, identity_start=True)
+    heads, ocd = networks.init_heads(jax.random.key(0), 4, cfg), networks.init_ocd(jax.random.key(0), cfg)
+    params = scene()._replace(heads=heads, ocd=ocd)
+    fine, coarse = (moved_at(params, cameras=look(), moving=moving) for moving in (True, False))
+    jax.tree.map(np.testing.assert_array_equal, fine, coarse)
+
+
+def test_dead_rows_are_invisible_and_get_no_gradient_even_when_they_hold_garbage():
+    params, dead = scene(), np.array([False, True, False, False, True, False])
+    alive = jnp.asarray(~dead)
+    fill = lambda rows: jnp.asarray(np.where(dead.reshape(-1, *[1] * (rows.ndim - 1)), np.inf, rows))
+    garbage = jax.tree.map(fill, params.gaussians)
+    gradient, moved = gradient_of_visible(params._replace(gaussians=garbage), alive, True)
+    expected, _ = gradient_of_visible(params, alive, True)
+    opacities = np.asarray(moved.opacities)
+    np.testing.assert_array_equal(opacities[:, dead], 0)
+    assert np.all(opacities[:, ~dead] > 0)
+    for leaf in gradient.gaussians:
+        np.testing.assert_array_equal(np.asarray(leaf)[dead], 0)
+        assert np.any(np.asarray(leaf)[~dead] != 0)
+    jax.tree.map(np.testing.assert_array_equal, gradient, expected)
+
+
+@pytest.mark.parametrize("moving", [False, True])
+def test_gradients(moving):
+    params, cameras = scene(), look()
+
+    def f(params, viewmat, time):
+        return moved_at(params, cameras=Camera(viewmat, cameras.K, time), moving=moving)
+
+    check_grads(f, (params, cameras.viewmat, cameras.time), 1, ["rev"], eps=1e-6)
+
+
+@pytest.mark.parametrize("moving", [False, True])
+def test_finite_at_extremes(moving):
+    params, cameras = scene(), look()
+    pose = np.asarray(cameras.viewmat[0])
+    means = np.array(params.gaussians.means)
+    means[:4] = [1e12] * 3, [-1e12] * 3, -pose[:3, :3].T @ pose[:3, 3], [1.0] * 3
+    gaussians = params.gaussians._replace(
+        means=jnp.asarray(means),
+        quats=jnp.asarray(np.zeros((N, 4))),
+        log_scales=jnp.asarray(np.full((N, 3), -200.0)),
+        logit_opacities=jnp.asarray(np.array([1e3, -1e3, 0.0, 0.0, 0.0, 0.0])),
+    )
+    gradient, moved = gradient_of_visible(params._replace(gaussians=gaussians), ALIVE, moving)
+    assert all(np.isfinite(x).all() for x in moved)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
+
+
+def test_production_precision_stays_single():
+    single = lambda tree: jax.tree.map(lambda x: x.astype("float32"), tree)
+    moved = moved_at(single(scene()), bounds=BOUNDS.astype("float32"), cameras=single(look()), moving=True)
+    assert {x.dtype for x in moved} == {np.dtype("float32")}

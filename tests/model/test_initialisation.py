@@ -1,0 +1,155 @@
+"""How a scene starts, and how it grows."""
+
+import dataclasses
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from l2dgs_jax.config import ModelConfig
+from l2dgs_jax.model import initialisation
+from l2dgs_jax.model.initialisation import SH_DC
+from l2dgs_jax.runtime.capacity import next_capacity
+from l2dgs_jax.training.parameter_groups import groups
+from l2dgs_jax.types import Camera
+
+CFG = ModelConfig(plane_size=4, plane_scales=(1,), plane_channels=2, hidden=4, sh_degree=1)
+POINTS = np.random.default_rng(0).uniform([-1, -1, 2], [1, 1, 4], (20, 3)).astype(np.float32)
+
+
+def cameras(centres):
+    viewmat = np.tile(np.eye(4), (len(centres), 1, 1))
+    viewmat[:, :3, 3] = -np.asarray(centres)
+    K = np.tile(np.array([[10.0, 0, 8], [0, 10, 6], [0, 0, 1]]), (len(centres), 1, 1))
+    return Camera(viewmat, K, np.linspace(0, 1, len(centres)))
+
+
+CAMERAS = cameras([[-1, 0, 0], [1, 0, 0], [0, 0, 0], [0, 0, 0]])
+
+
+def initialise(cfg=CFG, colors=None, points=POINTS, **arguments):
+    return initialisation.initialise(jax.random.key(0), points, colors, CAMERAS, cfg, capacity=32, **arguments)
+
+
+def test_one_gaussian_a_point_and_dead_rows_after_them():
+    start = initialise()
+    gaussians = start.params.gaussians
+    np.testing.assert_array_equal(start.alive, np.arange(32) < 20)
+    np.testing.assert_allclose(gaussians.means[:20], POINTS)
+    np.testing.assert_allclose(jax.nn.sigmoid(gaussians.logit_opacities[:20]), 0.1)
+    np.testing.assert_array_equal(gaussians.quats[:20], np.tile([1, 0, 0, 0], (20, 1)))
+    for rows in gaussians:
+        np.testing.assert_array_equal(rows[20:], 0)
+    np.testing.assert_allclose(start.bounds, [POINTS.min(0), POINTS.max(0)])
+    np.testing.assert_allclose(start.extent, 1.1)
+    assert start.params.hexplane.time[0].shape[1] == len(CAMERAS.time) // 2
+
+
+def test_scales_are_the_distance_to_the_nearest_points():
+    distances = np.linalg.norm(POINTS[:, None] - POINTS[None], axis=-1)
+    nearest = np.sort(distances, axis=1)[:, 1:4]
+    expected = np.sqrt(np.mean(nearest**2, axis=1))
+    np.testing.assert_allclose(np.exp(initialise().params.gaussians.log_scales[:20, 0]), expected, rtol=1e-5)
+
+
+def test_illumination_is_the_luminance_of_the_points():
+    colors = np.random.default_rng(1).uniform(size=(20, 3))
+    dc = initialise(colors=colors).params.gaussians.illumination_dc[:20, 0]
+    np.testing.assert_allclose(CFG.illumination_offset + SH_DC * dc, colors @ [0.2989, 0.587, 0.114], rtol=1e-6)
+    set_dc = initialise(dataclasses.replace(CFG, initial_illumination=0.8)).params.gaussians.illumination_dc[:20]
+    np.testing.assert_allclose(CFG.illumination_offset + SH_DC * set_dc, 0.8, rtol=1e-6)
+
+
+@pytest.mark.parametrize(("kind", "low"), [("uniform", 0.0), ("normal", -10.0)])
+def test_random_starts_have_their_distribution(kind, low):
+    points = np.random.default_rng(2).normal(size=(3000, 3))
+    cfg = dataclasses.replace(CFG, reflectance_init=kind)
+    start = initialisation.initialise(jax.random.key(0), points, None, CAMERAS, cfg, capacity=3000)
+    values = np.asarray(start.params.gaussians.reflectance)
+    mean, deviation = {"uniform": (0.5, 12**-0.5), "normal": (0, 1)}[kind]
+    assert abs(values.mean() - mean) < 0.05
+    assert abs(values.std() - deviation) < 0.05
+    assert values.min() >= low
+    assert (values.min() < 0) == (kind == "normal")
+
+
+def test_a_single_point_is_enough():
+    start = initialise(points=POINTS[:1])
+    assert np.isfinite(np.concatenate([np.ravel(x) for x in jax.tree.leaves(start.params)])).all()
+
+
+def test_observed_colors_are_those_of_the_pixels_that_points_project_to():
+    images = np.random.default_rng(3).uniform(size=(4, 12, 16, 3))
+    images[1:] = images[:1]
+    still = cameras([[0, 0, 0]] * 4)
+    point_in_pixel = lambda column, row, z: [(column + 0.5 - 8) / 10 * z, (row + 0.5 - 6) / 10 * z, z]
+    points = np.array([point_in_pixel(3, 5, 2.0), point_in_pixel(15, 11, 3.0), [0, 0, -1], [100, 0, 1]])
+    colors = initialisation.observed_colors(points, still, images)
+    np.testing.assert_allclose(colors[0], images[0, 5, 3], rtol=1e-6)
+    np.testing.assert_allclose(colors[1], images[0, 11, 15], rtol=1e-6)
+    np.testing.assert_allclose(colors[2:], np.tile(images.mean((0, 1, 2)), (2, 1)), rtol=1e-6)
+
+
+def test_observed_colors_take_the_median_over_frames():
+    images = np.zeros((3, 12, 16, 3))
+    images[:] = np.array([0.1, 0.2, 0.9])[:, None, None, None]
+    colors = initialisation.observed_colors(np.array([[0, 0, 2.0]]), cameras([[0, 0, 0]] * 3), images)
+    np.testing.assert_allclose(colors, 0.2, rtol=1e-6)
+
+
+@pytest.mark.parametrize("at_once", [initialisation.SEEN_AT_ONCE, 40])
+def test_observed_colors_are_the_same_when_few_are_held_at_once(monkeypatch, at_once):
+    rng = np.random.default_rng(4)
+    images, valid = rng.uniform(size=(7, 12, 16, 3)).astype(np.float16), rng.random((7, 12, 16)) < 0.6
+    spread = cameras(rng.uniform([-2, -1, -2], [2, 1, 3], (7, 3)))
+    monkeypatch.setattr(initialisation, "SEEN_AT_ONCE", at_once)
+    colors = initialisation.observed_colors(POINTS, spread, images, valid)
+
+    local = np.einsum("fij,pj->fpi", spread.viewmat[:, :3, :3], POINTS) + spread.viewmat[:, None, :3, 3]
+    pixels = np.floor(np.einsum("fij,fpj->fpi", spread.K, local) / np.where(local[..., 2:] > 0, local[..., 2:], np.inf))
+    mean = images.mean((0, 1, 2), np.float64, where=valid[..., None]).astype(np.float32)
+    some_seen = 0
+    for point, color in enumerate(colors):
+        seen = [
+            images[frame, int(row), int(column)].astype(np.float32)
+            for frame, (column, row, _) in enumerate(pixels[:, point])
+            if local[frame, point, 2] > 0
+            and (0 <= column < 16 and 0 <= row < 12)
+            and valid[frame, int(row), int(column)]
+        ]
+        some_seen += len(seen) > 1
+        np.testing.assert_array_equal(color, np.median(seen, axis=0) if seen else mean)
+    assert 5 < some_seen < len(POINTS)
+
+
+def test_every_parameter_has_a_group():
+    params = initialise().params
+    labels = jax.tree.leaves(groups(params))
+    assert len(labels) == len(jax.tree.leaves(params))
+    assert {"means", "reflectance", "planes", "heads", "ocd", "bafe"} <= set(labels)
+    assert groups(params).gaussians.log_scales == "scales"
+
+
+def test_the_ladder_climbs_in_steps_of_half():
+    sizes = sorted({next_capacity(count) for count in range(1, 50_000, 7)})
+    assert all(next_capacity(count) >= count for count in (1, 1024, 1025, 40_000))
+    assert all(1.3 < b / a < 1.7 for a, b in itertools.pairwise(sizes))
+
+
+def test_padding_appends_zero_rows():
+    padded = initialisation.pad_rows(jnp.ones((2, 3)), 4)
+    np.testing.assert_array_equal(padded, [[1] * 3, [1] * 3, [0] * 3, [0] * 3])
+
+
+def test_the_z_order_keeps_neighbours_together():
+    grid = np.stack(np.meshgrid(*[np.arange(8.0)] * 3), axis=-1).reshape(-1, 3)
+    shuffled = grid[np.random.default_rng(0).permutation(len(grid))]
+    ordered = shuffled[initialisation.z_order(shuffled)]
+    np.testing.assert_array_equal(np.unique(ordered, axis=0), np.unique(grid, axis=0))
+    # Every 8 and every 64 points in a row fill a cube of 2 and of 4 points an edge.
+    for size in (2, 4):
+        cubes = ordered.reshape(-1, size**3, 3)
+        np.testing.assert_array_equal(np.ptp(cubes, axis=1), size - 1)
+    np.testing.assert_array_equal(initialisation.z_order(np.ones((3, 3))), np.arange(3))

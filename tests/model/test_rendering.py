@@ -1,0 +1,27 @@
+import finished_run
+import numpy as np
+import pytest
+
+from l2dgs_jax.cameras.geometry import select_camera
+from l2dgs_jax.model.rendering import expected_depth
+from l2dgs_jax.types import RenderOutput
+
+
+@pytest.fixture(scope="module")
+def base(tmp_path_factory):
+    return tmp_path_factory.getbasetemp()
+
+
+def test_welllit_is_the_whole_outputs_and_grows_its_buffer(base):
+    run = finished_run.opened(base)
+    camera = select_camera(run.dataset.test.cameras, 0)
+    whole, short = run.renderer(), run.renderer()
+    short.pair_capacity = 8
+    np.testing.assert_allclose(short.welllit(camera), whole(camera).images.welllit, atol=1e-6)
+    assert short.pair_capacity > 8
+
+
+def test_expected_depth_divides_by_alpha_and_is_zero_where_nothing_is():
+    zero = np.zeros(())
+    output = RenderOutput(None, np.array([[0.5, 0.0]]), np.array([[1.5, 0.0]]), zero, zero, zero)
+    np.testing.assert_array_equal(expected_depth(output), [[3.0, 0.0]])

@@ -1,0 +1,72 @@
+"""Files and folders that are written whole or not at all."""
+
+import pytest
+
+from l2dgs_jax.errors import UserError
+from l2dgs_jax.runtime.files import new_folder, replacing
+
+
+def test_a_file_is_replaced_whole_or_not_at_all(tmp_path):
+    path = tmp_path / "file.txt"
+    path.write_text("old")
+
+    class PowerCutError(Exception):
+        pass
+
+    def cut():
+        with replacing(path) as temporary:
+            temporary.write_text("half of the n")
+            raise PowerCutError
+
+    with pytest.raises(PowerCutError):
+        cut()
+    assert path.read_text() == "old"
+    assert [p.name for p in tmp_path.iterdir()] == ["file.txt"]
+    with replacing(path) as temporary:
+        temporary.write_text("new")
+    assert path.read_text() == "new"
+
+
+def test_a_file_that_cannot_take_its_place_is_a_clear_error_and_leaves_nothing_behind(tmp_path):
+    path = tmp_path / "file.txt"
+
+    def fill_the_disk():
+        with replacing(path) as temporary:
+            temporary.write_text("half")
+            raise OSError(28, "No space left on device")
+
+    with pytest.raises(UserError, match=r"file\.txt: cannot be written \(No space left on device\)"):
+        fill_the_disk()
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_appears_whole_or_not_at_all(tmp_path):
+    def fill(path, then=None):
+        with new_folder(path) as place:
+            (place / "a.txt").write_text("a")
+            assert not path.exists() or not list(path.iterdir())
+            if then:
+                raise then
+
+    for error, raised in ((KeyError("x"), KeyError), (OSError(28, "No space left on device"), UserError)):
+        with pytest.raises(raised):
+            fill(tmp_path / "new", error)
+        assert not list(tmp_path.iterdir())
+    (tmp_path / "empty").mkdir()
+    for name in ("new", "deep/er", "empty"):
+        fill(tmp_path / name)
+        assert [path.name for path in (tmp_path / name).iterdir()] == ["a.txt"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["deep", "empty", "new"]
+
+
+def test_a_folder_does_not_take_the_place_of_anything(tmp_path):
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "mine").write_text("")
+    (tmp_path / "link").symlink_to(tmp_path / "elsewhere")
+    (tmp_path / "file").write_text("")
+    for name in ("full", "link", "file"):
+        with (
+            pytest.raises(UserError, match=f"{name}: exists already; expected a new or an empty folder"),
+            new_folder(tmp_path / name),
+        ):
+            raise AssertionError("entered")

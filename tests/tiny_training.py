@@ -1,0 +1,61 @@
+"""A scene and settings so small that training takes seconds."""
+
+import collections
+import dataclasses
+
+import jax
+import numpy as np
+
+from l2dgs_jax.config import PRESETS, DensityConfig
+from l2dgs_jax.data import Dataset, Split
+from l2dgs_jax.runtime import devices
+from l2dgs_jax.training import engine, initial_state
+from l2dgs_jax.types import Camera
+
+WIDTH, HEIGHT, FRAMES = 16, 12, 6
+
+
+def tiny(preset="default", **changes):
+    base = PRESETS[preset]
+    exponents = base.model.initial_exponents and (1.5, 9.0)
+    illumination = base.model.initial_illumination and 0.8
+    small = dataclasses.replace(
+        base.model,
+        initial_exponents=exponents,
+        initial_illumination=illumination,
+        plane_size=4,
+        plane_scales=(1, 2),
+        plane_channels=2,
+        hidden=8,
+        sh_degree=1,
+    )
+    density = DensityConfig(start=1, stop=100, interval=3, grad_threshold=1e-9, max_gaussians=60)
+    changes = {"coarse_steps": 4, "fine_steps": 4, "sh_warmup": 3, "density": density, "model": small} | changes
+    return dataclasses.replace(base, **changes)
+
+
+def make_dataset(seed=0):
+    rng = np.random.default_rng(seed)
+    points = rng.uniform([-1, -0.7, 2], [1, 0.7, 3], (25, 3)).astype(np.float32)
+    viewmat = np.tile(np.eye(4, dtype=np.float32), (FRAMES, 1, 1))
+    viewmat[:, 0, 3] = np.linspace(-0.2, 0.2, FRAMES)
+    intrinsics = np.tile(np.array([[14, 0, 8], [0, 14, 6], [0, 0, 1]], np.float32), (FRAMES, 1, 1))
+    cameras = Camera(viewmat, intrinsics, np.linspace(0, 1, FRAMES, dtype=np.float32))
+    images = rng.uniform(0, 0.2, (FRAMES, HEIGHT, WIDTH, 3)).astype(np.float16)
+    split = Split(tuple(map(str, range(FRAMES))), cameras, images, None, None)
+    return Dataset("tiny", WIDTH, HEIGHT, split, split, points, None)
+
+
+def finish(dataset, config, state=None, pair_capacity=None):
+    """The last step of a run."""
+    member = engine.Member(dataset.train, config, state or initial_state(dataset, config))
+    return collections.deque(engine.run([member], pair_capacity), maxlen=1).pop()
+
+
+def state_of(progress, member=0):
+    return devices.member(progress.states, member)
+
+
+def assert_equal_states(a, b):
+    for (path, x), y in zip(jax.tree_util.tree_leaves_with_path(a), jax.tree.leaves(b), strict=True):
+        np.testing.assert_array_equal(x, y, err_msg=jax.tree_util.keystr(path))
