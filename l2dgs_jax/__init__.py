@@ -3,10 +3,11 @@
 from importlib.metadata import version
 
 from l2dgs_jax.cameras import resize
-from l2dgs_jax.config import PRESETS, Config
+from l2dgs_jax.config import PRESETS, Config, DensityConfig, LossConfig, ModelConfig, OptimConfig
 from l2dgs_jax.data import Dataset, Split, load_dataset
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.kernels import use_kernels
+from l2dgs_jax.model.rendering import Renderer
 from l2dgs_jax.rasterizer import rasterize
 from l2dgs_jax.runs import Checkpoint, Recorder, Run, fit, open_run
 from l2dgs_jax.training import DivergedError, Progress, StepReport, TrainState
@@ -21,12 +22,17 @@ __all__ = [
     "Config",
     "Dataset",
     "Decomposition",
+    "DensityConfig",
     "DivergedError",
     "Gaussians",
+    "LossConfig",
+    "ModelConfig",
+    "OptimConfig",
     "Progress",
     "RasterOutput",
     "Recorder",
     "RenderOutput",
+    "Renderer",
     "Run",
     "Scene",
     "SceneParams",

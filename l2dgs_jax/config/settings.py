@@ -194,5 +194,9 @@ def from_dict(values: dict) -> Config:
         TypeError: a setting is unknown.
     """
     parts = {"model": ModelConfig, "loss": LossConfig, "optim": OptimConfig, "density": DensityConfig}
-    tuples = lambda items: {key: tuple(v) if isinstance(v, list) else v for key, v in items.items()}
-    return Config(**{key: parts[key](**tuples(v)) if key in parts else v for key, v in values.items()})
+    return Config(**{key: parts[key](**_with_tuples(v)) if key in parts else v for key, v in values.items()})
+
+
+def _with_tuples(values: dict[str, Any]) -> dict[str, Any]:
+    """Tuples again where JSON has made lists of them."""
+    return {key: tuple(v) if isinstance(v, list) else v for key, v in values.items()}

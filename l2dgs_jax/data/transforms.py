@@ -205,7 +205,8 @@ def _frame(name: str, path: Path, content: dict[str, Any], file: Path, time: flo
 def _intrinsics(
     path: Path, source: str, content: dict[str, Any], size: tuple[int, int]
 ) -> tuple[Float64[np.ndarray, "3 3"], Lens]:
-    number = lambda key, default: float(numbers(path, content, key, ())) if key in content else default
+    def number(key: str, default: float) -> float:
+        return float(numbers(path, content, key, ())) if key in content else default
 
     def focal(axis: str, length: int) -> float:
         if f"fl_{axis}" not in content and f"camera_angle_{axis}" in content:

@@ -72,14 +72,15 @@ def partial_ssim(a: Float[Array, "H W C"], b: Float[Array, "H W C"], mask: Bool[
     if min(a.shape[:2]) <= 2 * RADIUS:
         return masked_ssim(a, b, mask)
 
+    def shifted(x: Float[Array, "..."], axis: int) -> list[Float[Array, "..."]]:
+        length = x.shape[axis] - 2 * RADIUS
+        return [jax.lax.slice_in_dim(x, k, k + length, axis=axis) for k in range(len(WINDOW))]
+
     def blur(images: Float[Array, "H W C"]) -> Float[Array, "h w C"]:
         seen = jnp.asarray(mask, images.dtype)[..., None]
         for axis in (1, 0):
-            shifted = lambda x, axis=axis: [
-                jax.lax.slice_in_dim(x, k, k + x.shape[axis] - 2 * RADIUS, axis=axis) for k in range(len(WINDOW))
-            ]
-            count = jnp.stack(shifted(seen)).sum(0)
-            total = sum(float(w) * x for w, x in zip(WINDOW, shifted(images * seen), strict=True))
+            count = jnp.stack(shifted(seen, axis)).sum(0)
+            total = sum(float(w) * x for w, x in zip(WINDOW, shifted(images * seen, axis), strict=True))
             images = jnp.where(count > 0, total * len(WINDOW) / jnp.maximum(count, 1), 0)
             seen = jnp.asarray(count > 0, images.dtype)
         return images

@@ -72,12 +72,11 @@ def features(
     layout = Layout(tuple(space.shape[2] for space in planes.space), len(times), cfg.aggregation)
     everywhere = jnp.broadcast_to(unit.T[..., None], (3, len(points), len(layout.sizes)))
     cell, weight = _cell(everywhere, np.array(layout.sizes, np.int32)[None, None])
-    a_row_each = lambda x: tuple(x.reshape(3, -1))
     found = lookup(
         _table(planes.space),
         _table(tuple(_at_times(time, times) for time in planes.time)),
-        a_row_each(cell),
-        a_row_each(weight),
+        tuple(cell.reshape(3, -1)),
+        tuple(weight.reshape(3, -1)),
         layout,
     )
     return found.reshape(len(times), len(points), -1)
@@ -93,15 +92,17 @@ def regularisers(planes: HexPlane) -> tuple[Float[Array, ""], Float[Array, ""], 
         time_smoothness: squared second differences of the time planes in time.
         time_l1: absolute differences of the time planes from 1, the value that leaves a pair independent of time.
     """
-    total = lambda penalty, stacks: sum(3 * jnp.mean(penalty(stack)) for stack in stacks)
-    # Planes of two cells have no second difference.
-    bent = lambda stacks: [s[:, 2:] - 2 * s[:, 1:-1] + s[:, :-2] for s in stacks if s.shape[1] > 2]
     zero = jnp.zeros((), planes.space[0].dtype)
     return (
-        zero + total(jnp.square, bent(planes.space)),
-        zero + total(jnp.square, bent(planes.time)),
-        zero + total(lambda stack: jnp.abs(1 - stack), planes.time),
+        zero + sum(3 * jnp.mean(jnp.square(bend)) for bend in _second_differences(planes.space)),
+        zero + sum(3 * jnp.mean(jnp.square(bend)) for bend in _second_differences(planes.time)),
+        zero + sum(3 * jnp.mean(jnp.abs(1 - stack)) for stack in planes.time),
     )
+
+
+def _second_differences(stacks: tuple[Float[Array, "3 _ _ C"], ...]) -> list[Float[Array, "3 _ _ C"]]:
+    """Along the first axis of the planes; those of two cells have none."""
+    return [s[:, 2:] - 2 * s[:, 1:-1] + s[:, :-2] for s in stacks if s.shape[1] > 2]
 
 
 def _cell(unit: Float[Array, "*S"], size: int | np.ndarray) -> tuple[Int[Array, "*S"], Float[Array, "*S"]]:

@@ -59,7 +59,10 @@ def apply_heads(heads: MotionHeads, features: Float[Array, "*B F"]) -> tuple[Flo
     """
     hidden = _affine(heads.aggregate, features)
     active = jax.nn.relu(hidden)
-    move = lambda head: _affine(head[1], jax.nn.relu(_affine(head[0], active)))
+
+    def move(head: tuple[Linear, Linear]) -> Float[Array, "..."]:
+        return _affine(head[1], jax.nn.relu(_affine(head[0], active)))
+
     return hidden, Motion(
         means=move(heads.mean),
         quats=move(heads.quat),
@@ -188,9 +191,12 @@ def apply_conv(layer: Conv, x: Float[Array, "B H W I"]) -> Float[Array, "B H W O
 
 def _group_norm(layer: GroupNorm, x: Float[Array, "B H W C"], groups: int) -> Float[Array, "B H W C"]:
     """Zero mean and unit variance over each image and group of channels, then an affine map a channel."""
-    # Pooling the pixels first keeps the channel axis whole; statistics over a split axis are much slower on CPU.
-    group_mean = lambda y: y.mean((1, 2)).reshape(len(y), groups, -1).mean(-1)
-    pool = lambda y: jnp.repeat(group_mean(y), y.shape[-1] // groups, axis=-1)[:, None, None]
+
+    def pool(y: Float[Array, "B H W C"]) -> Float[Array, "B 1 1 C"]:
+        # Pooling the pixels first keeps the channel axis whole; statistics over a split axis are much slower on CPU.
+        means = y.mean((1, 2)).reshape(len(y), groups, -1).mean(-1)
+        return jnp.repeat(means, y.shape[-1] // groups, axis=-1)[:, None, None]
+
     centred = x - pool(x)
     gain = layer.scale[None, None, None] * jax.lax.rsqrt(pool(jnp.square(centred)) + GROUP_NORM_EPS)
     return centred * gain + layer.bias[None, None, None]

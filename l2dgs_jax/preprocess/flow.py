@@ -26,11 +26,15 @@ class Matches(NamedTuple):
 
 def brightened(images: Float[np.ndarray, "F H W 3"]) -> UInt8[np.ndarray, "F H W"]:
     """Grey copies for matching: noise blurred away, then one stretch of contrast for all frames."""
-    smooth = lambda image: cv2.GaussianBlur(cv2.cvtColor(image.astype(np.float32), cv2.COLOR_RGB2GRAY), (0, 0), BLUR)
-    sample = [smooth(images[i]) for i in range(0, len(images), max(len(images) // 16, 1))]
+    sample = [_smooth_grey(images[i]) for i in range(0, len(images), max(len(images) // 16, 1))]
     low, high = np.percentile(sample, (0.5, 99.5))
-    stretched = lambda grey: np.clip((grey - low) / max(high - low, 1e-6), 0, 1)
-    return np.stack([np.round(255 * stretched(smooth(image))).astype(np.uint8) for image in images])
+    span = max(high - low, 1e-6)
+    stretched = (np.clip((_smooth_grey(image) - low) / span, 0, 1) for image in images)
+    return np.stack([np.round(255 * grey).astype(np.uint8) for grey in stretched])
+
+
+def _smooth_grey(image: Float[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "H W"]:
+    return cv2.GaussianBlur(cv2.cvtColor(image.astype(np.float32), cv2.COLOR_RGB2GRAY), (0, 0), BLUR)
 
 
 def optical_flow(

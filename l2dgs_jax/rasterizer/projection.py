@@ -72,8 +72,7 @@ def project(
     halves = _half(jacobian, _rotation(*_unit(*quats.T)), tuple(scales.T))
     covariance = fusion_boundary(partial(_covariance, eps2d=eps2d))(*halves)
     conic = fusion_boundary(partial(_conic, eps2d=eps2d))(*covariance)
-    gather = lambda columns: jnp.stack(columns).T
-    return Projected(gather(centre), gather(covariance), gather(conic), depth, visible)
+    return Projected(jnp.stack(centre).T, jnp.stack(covariance).T, jnp.stack(conic).T, depth, visible)
 
 
 # Every entry of a point or a matrix is a column, one vector over all Gaussians: arithmetic with whole columns is what
@@ -120,7 +119,9 @@ def _through_lens(
         tangent = jnp.clip(normalised[axis], -(centre / focal + margin), (size[axis] - centre) / focal + margin)
         return tuple(focal / depth * (viewmat[axis, k] - tangent * viewmat[2, k]) for k in range(3))
 
-    pixel = lambda axis: K[axis, 0] * normalised[0] + K[axis, 1] * normalised[1] + K[axis, 2]
+    def pixel(axis: int) -> Column:
+        return K[axis, 0] * normalised[0] + K[axis, 1] * normalised[1] + K[axis, 2]
+
     return (pixel(0), pixel(1)), (row(0), row(1))
 
 

@@ -88,7 +88,10 @@ def _list(path: Path, content: dict[str, Any], key: str, kind: type) -> list:
     """The distinct values of a list that must hold some, all of one type."""
     values: Any = content.get(key)
     name = {str: "names", int: "whole numbers from 0 below 2^31"}[kind]
-    fits = lambda v: isinstance(v, kind) and not isinstance(v, bool) and (kind is str or v in range(2**31))
+
+    def fits(value: Any) -> bool:
+        return isinstance(value, kind) and not isinstance(value, bool) and (kind is str or value in range(2**31))
+
     if not isinstance(values, list) or not values or not all(map(fits, values)) or len(set(values)) < len(values):
         raise UserError(f"{path}: {key} is {values!r}; expected a list of different {name}, at least one")
     return values
@@ -147,5 +150,8 @@ def _variants(path: Path, tables: Any) -> list[tuple[str, dict[str, Any]]]:
 
 def _labels(point: dict[str, Any]) -> list[str]:
     """What a combination is called in a folder's name."""
-    text = lambda value: "_".join(map(str, value)) if isinstance(value, tuple) else str(value)
+
+    def text(value: Any) -> str:
+        return "_".join(map(str, value)) if isinstance(value, tuple) else str(value)
+
     return [f"{name.split('.')[-1]}{text(value)}" for name, value in point.items()]

@@ -66,8 +66,9 @@ def total(
         "illumination_tv": (cfg.illumination_tv, lambda: total_variation(images.illumination)),
         "exponent_prior": (cfg.exponent_prior, lambda: exponent_prior(images.attenuation, exponent_target)),
     }
-    absent = lambda weight: isinstance(weight, float | int) and weight == 0
-    values = {name: term() for name, (weight, term) in terms.items() if not absent(weight)}
+    values = {
+        name: term() for name, (weight, term) in terms.items() if not (isinstance(weight, float | int) and weight == 0)
+    }
     return jnp.stack([terms[name][0] * value for name, value in values.items()]).sum(), values
 
 

@@ -75,8 +75,12 @@ def adam(
 
     def init(params: PyTree) -> AdamState:
         # Two trees of zeros, not one used twice: buffers that are donated may not be shared.
-        zeros = lambda: jax.tree.map(jnp.zeros_like, params)
-        return AdamState(jnp.zeros((), jnp.int32), zeros(), zeros(), rates)
+        return AdamState(
+            step=jnp.zeros((), jnp.int32),
+            mu=jax.tree.map(jnp.zeros_like, params),
+            nu=jax.tree.map(jnp.zeros_like, params),
+            schedules=rates,
+        )
 
     def update(gradients: PyTree, state: AdamState, params: PyTree) -> tuple[PyTree, AdamState]:
         del params

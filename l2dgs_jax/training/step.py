@@ -1,5 +1,7 @@
 """A training step of one scene as pure functions: the objective, the update, the start of a stage, densification."""
 
+from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple, TypeVar
 
 import jax
@@ -196,11 +198,13 @@ def densify(state: TrainState, config: Config) -> tuple[TrainState, Int[Array, "
     scene = state.scene
     key = jax.random.fold_in(jax.random.key(config.seed), state.step)
     result = densification.densify(scene.params.gaussians, scene.alive, state.stats, scene.extent, key, config.density)
-    forget = lambda rows: jnp.where(result.changed.reshape(-1, *[1] * (rows.ndim - 1)), 0, rows)
-    moments = lambda tree: tree._replace(gaussians=jax.tree.map(forget, tree.gaussians))
+
+    def forget(rows: Float[Array, "..."]) -> Float[Array, "..."]:
+        return jnp.where(result.changed.reshape(-1, *[1] * (rows.ndim - 1)), 0, rows)
+
     grown = TrainState(
         scene=scene._replace(params=scene.params._replace(gaussians=result.gaussians), alive=result.alive),
-        adam=state.adam._replace(mu=moments(state.adam.mu), nu=moments(state.adam.nu)),
+        adam=state.adam._replace(mu=_map_gaussians(forget, state.adam.mu), nu=_map_gaussians(forget, state.adam.nu)),
         stats=jax.tree.map(jnp.zeros_like, state.stats),
         step=state.step,
     )
@@ -209,11 +213,11 @@ def densify(state: TrainState, config: Config) -> tuple[TrainState, Int[Array, "
 
 def with_capacity(state: TrainState, capacity: int) -> TrainState:
     """The same state with dead rows appended up to `capacity`."""
-    grow = lambda tree: tree._replace(gaussians=jax.tree.map(lambda x: pad_rows(x, capacity), tree.gaussians))
+    pad = partial(pad_rows, capacity=capacity)
     return TrainState(
-        scene=state.scene._replace(params=grow(state.scene.params), alive=pad_rows(state.scene.alive, capacity)),
-        adam=state.adam._replace(mu=grow(state.adam.mu), nu=grow(state.adam.nu)),
-        stats=jax.tree.map(lambda x: pad_rows(x, capacity), state.stats),
+        scene=state.scene._replace(params=_map_gaussians(pad, state.scene.params), alive=pad(state.scene.alive)),
+        adam=state.adam._replace(mu=_map_gaussians(pad, state.adam.mu), nu=_map_gaussians(pad, state.adam.nu)),
+        stats=jax.tree.map(pad, state.stats),
         step=state.step,
     )
 
@@ -221,6 +225,11 @@ def with_capacity(state: TrainState, capacity: int) -> TrainState:
 def tree_where(condition: Bool[Array, ""], new: T, old: T) -> T:
     """One tree or the other."""
     return jax.tree.map(lambda new, old: jnp.where(condition, new, old), new, old)
+
+
+def _map_gaussians(function: Callable[[Array], Array], params: SceneParams) -> SceneParams:
+    """`params`, or moments of them, with a function applied to every array of the Gaussians."""
+    return params._replace(gaussians=jax.tree.map(function, params.gaussians))
 
 
 def _mean(tree: T, axis: str | None) -> T:

@@ -85,19 +85,23 @@ def golden_loss(arrays, weights, width, height):
 
 
 @pytest.mark.parametrize(
-    ("name", "dtype"),
+    ("name", "dtype", "form"),
     [
-        ("s500_96x64", jnp.float64),
-        ("s500_96x64", jnp.float32),
-        ("s500o_96x64", jnp.float32),
-        ("s2000_160x96", jnp.float32),
+        ("s500_96x64", jnp.float64, None),
+        ("s500_96x64", jnp.float32, None),
+        ("s500o_96x64", jnp.float32, None),
+        ("s2000_160x96", jnp.float32, None),
+        ("s500_96x64", jnp.float32, "accelerator"),
+        ("s500o_96x64", jnp.float32, "accelerator"),
+        ("s500o_96x64", jnp.float64, "reference"),
     ],
 )
-def test_golden_scenes(name, dtype):
+def test_golden_scenes(name, dtype, form):
     golden = np.load(GOLDEN / f"{name}.npz")
     arrays = [jnp.asarray(golden[f"in_{key}"], dtype) for key in NAMES]
     weights = [jnp.asarray(golden[f"in_w_{key}"], dtype) for key in ("features", "alpha", "depth")]
-    output, gradients = golden_loss(arrays, weights, int(golden["in_width"]), int(golden["in_height"]))
+    with use_kernels(form):
+        output, gradients = golden_loss(arrays, weights, int(golden["in_width"]), int(golden["in_height"]))
     assert not output.overflow
     clear = ~golden["out_ambiguous"]
     assert clear.mean() > 0.95
@@ -158,12 +162,61 @@ def test_numerical_gradients():
     )
 
 
+@pytest.mark.parametrize("form", [None, "accelerator"])
 @pytest.mark.parametrize("batch", [fast, jax.jit(jax.vmap(fast))], ids=["views", "vmap"])
-def test_a_batch_equals_a_loop(batch):
+def test_a_batch_equals_a_loop(batch, form):
     arrays = stacked(range(3))
     apart = [fast(*(x[v] for x in arrays)) for v in range(3)]
-    for actual, expected in zip(batch(*arrays), jax.tree.map(lambda *x: jnp.stack(x), *apart), strict=True):
+    with use_kernels(form):
+        together = batch(*arrays)
+    for actual, expected in zip(together, jax.tree.map(lambda *x: jnp.stack(x), *apart), strict=True):
         assert_close(actual, expected, 1e-12)
+
+
+def test_views_may_share_their_gaussians():
+    *gaussians, viewmat, K = scene(14)
+    viewmats = jnp.stack([viewmat, viewmat.at[0, 3].add(0.3)])
+    Ks = jnp.stack([K, K.at[0, 0].add(4)])
+    values, gradients = fast(*gaussians, viewmats, Ks)
+    apart = [fast(*gaussians, v, k) for v, k in zip(viewmats, Ks, strict=True)]
+    assert_close(values, jax.tree.map(lambda *x: jnp.stack(x), *(values for values, _ in apart)), 1e-12)
+    assert_close(gradients[:5], [a + b for a, b in zip(*(gradients[:5] for _, gradients in apart), strict=True)], 1e-11)
+    with pytest.raises(ValueError, match="expected as many, or shared ones"):
+        rasterize(*(jnp.stack([x] * 3) for x in gaussians), viewmats, Ks, WIDTH, HEIGHT)
+
+
+def test_depth_is_accumulated_or_expected():
+    golden = np.load(GOLDEN / "s500_96x64.npz")
+    arrays = [jnp.asarray(golden[f"in_{key}"]) for key in NAMES]
+    drawn = rasterize(*arrays, int(golden["in_width"]), int(golden["in_height"]), depth_mode="expected")
+    clear = ~golden["out_ambiguous"] & (golden["out_alpha"] > 0.01)
+    np.testing.assert_allclose(np.asarray(drawn.depth)[clear], golden["out_depth_exp"][clear], rtol=1e-4)
+
+
+def test_the_near_plane_hides_and_the_blur_widens():
+    means, *rest = scene(15)
+    depths = means[:, 2] + rest[-2][2, 3]
+    middle = float(jnp.median(depths))
+    hidden = rasterize(means, *rest, WIDTH, HEIGHT, near_plane=middle)
+    np.testing.assert_array_equal(
+        hidden.radii > 0, (depths > middle) & (rasterize(means, *rest, WIDTH, HEIGHT).radii > 0)
+    )
+    dot = (jnp.array([[0.0, 0.0, 3.0]]), jnp.ones((1, 4)), jnp.full((1, 3), 1e-6), jnp.ones(1), jnp.ones((1, 1)))
+    # A point is a blur of that variance: alpha at a distance of d pixels is exp(-d^2 / (2 eps2d)).
+    camera = jnp.eye(4), jnp.array([[10.0, 0, 8.5], [0, 10, 8.5], [0, 0, 1]])
+    for eps2d in (0.3, 1.5):
+        alpha = rasterize(*dot, *camera, 17, 17, eps2d=eps2d).alpha
+        np.testing.assert_allclose(alpha[8, 9], np.exp(-0.5 / eps2d), rtol=1e-5)
+
+
+@pytest.mark.parametrize("form", ["reference", "cpu", "accelerator"])
+def test_nothing_at_all_is_black(form):
+    means, quats, scales, opacities, features, viewmat, K = scene(1)
+    empty = [x[:0] for x in (means, quats, scales, opacities, features)]
+    with use_kernels(form):
+        values, gradients = fast(*empty, viewmat, K)
+    assert all(not x.any() for x in (*values, *gradients))
+    assert values[0].shape == (HEIGHT, WIDTH, 2)
 
 
 def test_members_may_share_what_they_draw():
@@ -203,12 +256,14 @@ def test_nothing_is_drawn_behind_the_camera():
         assert np.all(x == 0)
 
 
-def test_nan_is_not_hidden():
+@pytest.mark.parametrize("form", [None, "reference", "accelerator"])
+def test_nan_is_not_hidden(form):
     arrays = list(scene(8))
     for position in range(5):
         broken = list(arrays)
         broken[position] = broken[position].at[7].set(jnp.nan)
-        assert np.isnan(fast(*broken)[0][0]).any(), NAMES[position]
+        with use_kernels(form):
+            assert np.isnan(fast(*broken)[0][0]).any(), NAMES[position]
 
 
 def test_radii_bound_what_is_drawn():
@@ -234,8 +289,13 @@ def test_probe_moves_the_centres():
     assert_close((probed.features, probed.alpha, probed.depth), shifted)
 
 
-def test_overflow_is_reported():
-    arrays = scene(3)
+@pytest.mark.parametrize("form", [None, "accelerator"])
+def test_overflow_is_reported(form):
+    with use_kernels(form):
+        check_overflow(scene(3))
+
+
+def check_overflow(arrays):
     short = rasterize(*arrays, WIDTH, HEIGHT, pair_capacity=50)
     needed = int(short.pairs)
     assert short.overflow

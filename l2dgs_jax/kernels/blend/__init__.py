@@ -78,7 +78,9 @@ def _folded(
 
     @folded.def_vmap
     def rule(members: int, batched: Any, *arguments: Any) -> tuple[Float[Array, "..."], bool]:
-        widen = lambda x, is_batched: x if is_batched else jnp.broadcast_to(x[None], (members, *x.shape))
+        def widen(x: Any, is_batched: bool) -> Any:
+            return x if is_batched else jnp.broadcast_to(x[None], (members, *x.shape))
+
         packed, lists, *images = jax.tree.map(widen, arguments, tuple(batched))
         first = lambda size: size * jnp.arange(members, dtype=jnp.int32)[:, None]
         count, capacity = packed.shape[1], lists.gaussians.shape[1]

@@ -5,7 +5,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from l2dgs_jax.kernels import loops
 from l2dgs_jax.kernels.blend import accelerator
@@ -46,9 +46,7 @@ def gradient(
     blocks, tiles, _ = in_blocks(lists, BLOCK, width, height, packed.dtype)
 
     def every_block(packed: Float[Array, "G D"], gaussians: Int[Array, " M"], *blocks: Any) -> Sums:
-        # Rows beyond a list's end are zero: to leave them out takes longer than to add them.
-        add_rows = lambda sums, ids, listed, rows: loops.add_rows(sums, ids, rows)
-        add = partial(add_moments, stride=STRIDE, add_rows=add_rows)
+        add = partial(add_moments, stride=STRIDE, add_rows=_add_rows)
         return jax.lax.scan(
             lambda sums, block: (add(sums, packed, gaussians, *block), None), jnp.zeros_like(packed), blocks
         )[0]
@@ -56,3 +54,8 @@ def gradient(
     return from_moments(
         packed, native_call(every_block)(packed, lists.gaussians, blocks, output[tiles], cotangent[tiles])
     )
+
+
+def _add_rows(sums: Sums, ids: Int[Array, "K B"], listed: Bool[Array, "K B"], rows: Float[Array, "K B D"]) -> Sums:
+    del listed  # rows beyond a list's end are zero: to leave them out takes longer than to add them
+    return loops.add_rows(sums, ids, rows)

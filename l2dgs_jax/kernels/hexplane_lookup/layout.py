@@ -39,10 +39,15 @@ def lerp(start: Float[Array, "*S"], end: Float[Array, "*S"], weight: Float[Array
 
 def of_scale(layout: Layout, scale: Int[Array, "*M"]) -> OfScale:
     """Cells of a spatial axis at a scale, and its first rows in the tables of space and of lines."""
+
+    def at_scale(values: Int[np.ndarray, " S"]) -> Int[Array, "..."]:
+        return jnp.asarray(values, jnp.int32).at[scale].get(mode="promise_in_bounds", wrap_negative_indices=False)
+
+    def first_row(counts: Int[np.ndarray, " S"]) -> Int[Array, "..."]:
+        return at_scale(np.cumsum(counts) - counts)
+
     sizes = np.array(layout.sizes, np.int32)
-    at_scale = lambda x: jnp.asarray(x, jnp.int32).at[scale].get(mode="promise_in_bounds", wrap_negative_indices=False)
-    first = lambda counts: at_scale(np.cumsum(counts) - counts)
-    return at_scale(sizes), first(3 * sizes**2), first(3 * layout.views * sizes)
+    return at_scale(sizes), first_row(3 * sizes**2), first_row(3 * layout.views * sizes)
 
 
 def rows_read(views: int, of_scale: OfScale, cell: Cells) -> tuple[Corners, Ends]:

@@ -32,8 +32,8 @@ def gradient(
     cotangent: Float[Array, "V M C"],
 ) -> tuple[Float[Array, "R C"], Float[Array, "L C"], Weights]:
     """The gradients of `lookup` in `space`, `lines` and `weight`."""
-    look = lambda space, lines, weight: lookup(layout, space, lines, cell, weight)
-    return jax.vjp(look, space, lines, weight)[1](cotangent)
+    _, pull = jax.vjp(lambda space, lines, weight: lookup(layout, space, lines, cell, weight), space, lines, weight)
+    return pull(cotangent)
 
 
 def _features(

@@ -37,8 +37,10 @@ def list_pairs(
                 slots = write(slots, end, slot)
                 return jnp.minimum(end + reaches_tile(own, x, y).astype(jnp.int32), capacity), tiles, slots
 
-            in_row = lambda row, state: loop(left + width, partial(list_tile, row), state, first=left)
-            return loop(top + height, in_row, state, first=top)
+            def list_row(row: Index, state: Listed) -> Listed:
+                return loop(left + width, partial(list_tile, row), state, first=left)
+
+            return loop(top + height, list_row, state, first=top)
 
         tiles = jnp.full(capacity + 1, nowhere, jnp.int32)
         start = (jnp.int32(0), tiles, jnp.zeros_like(tiles))

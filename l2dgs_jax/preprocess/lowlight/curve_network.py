@@ -44,7 +44,10 @@ def init(key: PRNGKeyArray, width: int) -> CurveNet:
         width: channels C of every hidden layer.
     """
     keys = iter(jax.random.split(key, 11))
-    layers = lambda *sizes: tuple(init_conv(next(keys), 3, inputs, outputs) for inputs, outputs in sizes)
+
+    def layers(*sizes: tuple[int, int]) -> tuple[Conv, ...]:
+        return tuple(init_conv(next(keys), 3, inputs, outputs) for inputs, outputs in sizes)
+
     first = ((1, width), *((width, width),) * 3)
     last = ((3 * width, width), (3 * width, width), (3 * width, ITERATIONS))
     return CurveNet(layers(*first), layers(*first, *last))
@@ -60,9 +63,11 @@ def curves(
         lightness: in [0, 1].
         exposure: the lightness wanted around each pixel, in [0, 1].
     """
-    as_batch = lambda plane: plane.reshape(-1, *plane.shape[-2:], 1)
-    relu_conv = lambda layer, *features: jax.nn.relu(apply_conv(layer, jnp.concatenate(features, -1)))
-    e, x = [as_batch(exposure)], [as_batch(lightness)]
+
+    def relu_conv(layer: Conv, *features: Float[Array, "B H W _"]) -> Float[Array, "B H W C"]:
+        return jax.nn.relu(apply_conv(layer, jnp.concatenate(features, -1)))
+
+    e, x = ([plane.reshape(-1, *plane.shape[-2:], 1)] for plane in (exposure, lightness))
     for layer in net.exposure:
         e.append(relu_conv(layer, e[-1]))
     for layer in net.image[:4]:

@@ -179,7 +179,10 @@ def _darkener(
     Raises:
         UserError: the pictures are no brighter than the exposure, or the weights cannot be read.
     """
-    light = lambda i: darkening.lightness(_floats(pictures[i]), cfg.lab_order)[counted[i]]
+
+    def light(i: int) -> Float32[np.ndarray, " P"]:
+        return darkening.lightness(_floats(pictures[i]), cfg.lab_order)[counted[i]]
+
     stride = -(-sum(picture.size // 3 for picture in pictures) // SAMPLE)
     sample = np.concatenate([light(i)[::stride] for i in range(len(pictures))])
     if sample.mean() <= darkening.exposure_map(sample, min(exposures)).mean():
@@ -199,8 +202,12 @@ def _darkener(
 def _twin(split: Split, dark: list[Bytes], welllit: list[Bytes]) -> Split:
     if not dark:
         return split
-    stack = lambda pictures: np.stack([_floats(picture).astype(np.float16) for picture in pictures])
-    return dataclasses.replace(split, images=stack(dark), welllit=stack(welllit))
+    return dataclasses.replace(split, images=_stack(dark), welllit=_stack(welllit))
+
+
+def _stack(pictures: list[Bytes]) -> Float16[np.ndarray, "F H W 3"]:
+    """Values in [0, 1] at the precision of a scene's frames."""
+    return np.stack([_floats(picture).astype(np.float16) for picture in pictures])
 
 
 def _floats(picture: Bytes) -> Float32[np.ndarray, "H W 3"]:

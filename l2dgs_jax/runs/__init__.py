@@ -1,0 +1,33 @@
+"""Runs: trained scenes in memory, and the folders that they lie in."""
+
+from l2dgs_jax.runs.checkpoints import Checkpoint
+from l2dgs_jax.runs.fitting import fit
+from l2dgs_jax.runs.folder import (
+    CHECKPOINT,
+    COARSE,
+    CONTACT_SHEET,
+    METRICS,
+    SETTINGS,
+    VIDEO,
+    open_run,
+    read_settings,
+    write_settings,
+)
+from l2dgs_jax.runs.recorder import Recorder
+from l2dgs_jax.runs.run import Run
+
+__all__ = [
+    "CHECKPOINT",
+    "COARSE",
+    "CONTACT_SHEET",
+    "METRICS",
+    "SETTINGS",
+    "VIDEO",
+    "Checkpoint",
+    "Recorder",
+    "Run",
+    "fit",
+    "open_run",
+    "read_settings",
+    "write_settings",
+]

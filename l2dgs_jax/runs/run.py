@@ -1,0 +1,63 @@
+"""A trained scene together with what it was trained on."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from l2dgs_jax.config import Config
+from l2dgs_jax.data import Dataset
+from l2dgs_jax.model.rendering import Renderer
+from l2dgs_jax.training.step import TrainState, sh_degree
+from l2dgs_jax.types import Camera, RenderOutput
+
+
+@dataclass(frozen=True)
+class Run:
+    """A trained scene.
+
+    Attributes:
+        config: its settings, what they left to the data filled in.
+        dataset: the scene's footage.
+        state: where its training stands.
+        folder: where it lies on disk, if it does.
+    """
+
+    config: Config
+    dataset: Dataset
+    state: TrainState
+    folder: Path | None = None
+    _renderers: dict[tuple[int, int], Renderer] = field(default_factory=dict, init=False, repr=False, compare=False)
+
+    @property
+    def name(self) -> str:
+        """For messages: the folder, or the name of the data set."""
+        return str(self.folder or self.dataset.name)
+
+    @property
+    def moving(self) -> bool:
+        """Whether the state is past the coarse stage, in which nothing moves."""
+        return int(self.state.step) > self.config.coarse_steps
+
+    def render(self, camera: Camera, width: int | None = None, height: int | None = None) -> RenderOutput:
+        """Render one camera at its instant: well-lit and low-light image, L, R, B1, B2, alpha and depth.
+
+        Views of a new size are compiled for it once. No gradients: `model.rendering.render` has them.
+
+        Args:
+            camera: one camera, `K` in pixels of the image wanted; `cameras.resize` makes other sizes of a given one.
+            width: of the image, pixels; the data set's if not given.
+            height: likewise.
+        """
+        return self.renderer(width, height)(camera)
+
+    def renderer(self, width: int | None = None, height: int | None = None) -> Renderer:
+        """What `render` draws images of a size with."""
+        size = width or self.dataset.width, height or self.dataset.height
+        if size not in self._renderers:
+            self._renderers[size] = Renderer(
+                self.state.scene,
+                self.config.model,
+                *size,
+                moving=self.moving,
+                sh_degree=int(sh_degree(int(self.state.step), self.config)),
+            )
+        return self._renderers[size]

@@ -1,0 +1,46 @@
+"""Where cameras are, and cameras of other sizes."""
+
+import jax.numpy as jnp
+import numpy as np
+from jax.test_util import check_grads
+from scipy.spatial.transform import Rotation
+
+from l2dgs_jax.cameras import camera_centres, camera_extent, resize, select_camera
+from l2dgs_jax.types import Camera
+
+
+def cameras(centres):
+    count = len(centres)
+    viewmat = np.tile(np.eye(4), (count, 1, 1))
+    viewmat[:, :3, :3] = Rotation.random(count, 0).as_matrix()
+    viewmat[:, :3, 3] = -np.einsum("fij,fj->fi", viewmat[:, :3, :3], centres)
+    K = np.tile(np.array([[14.0, 0.3, 8], [0, 15, 6], [0, 0, 1]]), (count, 1, 1))
+    return Camera(viewmat, K, np.linspace(0, 1, count))
+
+
+CENTRES = np.random.default_rng(1).normal(size=(5, 3))
+
+
+def test_centres_of_numpys_and_of_jaxs_cameras():
+    viewmats = cameras(CENTRES).viewmat
+    np.testing.assert_allclose(camera_centres(viewmats), CENTRES, atol=1e-12)
+    np.testing.assert_allclose(camera_centres(jnp.asarray(viewmats[2])), CENTRES[2], atol=1e-12)
+    assert isinstance(camera_centres(viewmats), np.ndarray)
+    check_grads(camera_centres, (jnp.asarray(viewmats),), order=1)
+
+
+def test_the_extent_is_the_radius_with_a_margin():
+    circle = np.array([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]]) + 7
+    np.testing.assert_allclose(camera_extent(cameras(circle)), 1.1)
+    assert camera_extent(cameras(circle[:1])) == 0
+
+
+def test_a_resized_camera_sees_the_same():
+    camera = select_camera(cameras(CENTRES), 3)
+    point = np.array([0.2, -0.1, 3.0])
+    pixel = lambda camera: (np.asarray(camera.K) @ point)[:2] / point[2]
+    np.testing.assert_allclose(pixel(resize(camera, 2.5)), 2.5 * pixel(camera), rtol=1e-12)
+    np.testing.assert_array_equal(resize(camera, 2).viewmat, camera.viewmat)
+    batch = resize(cameras(CENTRES), 0.5).K
+    np.testing.assert_allclose(batch[:, 1, 1], 7.5)
+    np.testing.assert_allclose(batch[:, 2], [[0, 0, 1]] * 5)

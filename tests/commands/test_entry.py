@@ -1,0 +1,43 @@
+"""`l2dgs COMMAND` and `python -m l2dgs_jax.COMMAND`."""
+
+import subprocess
+import sys
+
+import pytest
+
+from l2dgs_jax.__main__ import COMMANDS
+
+
+def run(*arguments):
+    return subprocess.run([sys.executable, *arguments], capture_output=True, text=True)
+
+
+def test_the_list_of_commands():
+    done = run("-m", "l2dgs_jax", "--help")
+    assert done.returncode == 0
+    assert all(f"\n  {name} " in done.stdout for name in COMMANDS)
+    assert run("-m", "l2dgs_jax").stdout == done.stdout
+
+
+def test_an_unknown_command_is_one_sentence():
+    done = run("-m", "l2dgs_jax", "trian")
+    assert done.returncode == 2
+    assert done.stderr.startswith("error: trian: no such command; expected one of train, evaluate")
+    assert done.stderr.count("\n") == 1
+
+
+def test_both_ways_to_a_command_do_the_same(tmp_path):
+    for name, way in (("a", ["l2dgs_jax.convert"]), ("b", ["l2dgs_jax", "convert"])):
+        done = run("-m", *way, "demo", str(tmp_path / name), "--to", "transforms")
+        assert done.returncode == 0, done.stderr
+    a, b = (sorted(p.relative_to(tmp_path / name) for p in (tmp_path / name).rglob("*")) for name in "ab")
+    assert a == b
+    assert len(a) > 44
+
+
+@pytest.mark.parametrize("way", [["l2dgs_jax.convert"], ["l2dgs_jax", "convert"]], ids=["module", "script"])
+def test_a_mistake_is_one_sentence_either_way(way, tmp_path):
+    done = run("-m", *way, str(tmp_path / "nonsuch"), str(tmp_path / "out"), "--to", "llff")
+    assert done.returncode == 2
+    assert done.stderr.startswith("error: ")
+    assert done.stderr.count("\n") == 1

@@ -1,0 +1,79 @@
+"""`fit`: from a data set to a run, without files."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from tiny_training import make_dataset, tiny
+
+from l2dgs_jax.config import PRESETS, overrides
+from l2dgs_jax.errors import UserError
+from l2dgs_jax.runs import Checkpoint, fit
+from l2dgs_jax.runtime import devices
+from l2dgs_jax.training import engine, initial_state
+from l2dgs_jax.training.step import StepReport
+
+
+@pytest.fixture
+def dataset():
+    return make_dataset()
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    """Steps that only count."""
+
+    def take(states, batches, values, number, **_):
+        return states._replace(step=states.step + 1), StepReport(*[jnp.zeros(1)] * 6), engine.Tally(0, 1)
+
+    monkeypatch.setattr(engine, "train_steps", take)
+
+
+def test_every_step_is_told_and_the_last_state_is_the_runs(dataset, quick):
+    seen = []
+    config = tiny(coarse_steps=2, fine_steps=3, density=PRESETS["default"].density)
+    run = fit(dataset, config, lambda progress: seen.append(int(devices.member(progress.states, 0).step)))
+    assert seen == [1, 2, 3, 4, 5]
+    assert run.state.step == 5
+    assert run.moving
+    assert run.folder is None
+    assert run.name == "tiny"
+
+
+def test_a_training_goes_on_from_a_state(dataset, quick):
+    config = tiny(coarse_steps=2, fine_steps=3, density=PRESETS["default"].density)
+    state = initial_state(dataset, config)._replace(step=jnp.int32(4))
+    seen = []
+    assert fit(dataset, config, seen.append, start=Checkpoint(state, 2048)).state.step == 5
+    assert [progress.step for progress in seen] == [5]
+    assert seen[0].pair_capacity == 2048
+    finished = state._replace(step=jnp.int32(5))
+    assert fit(dataset, config, start=Checkpoint(finished, 2048)).state is finished
+
+
+def test_what_is_left_to_the_data_is_filled_in(dataset, quick):
+    config = overrides.replace(
+        tiny(coarse_steps=1, fine_steps=0), {"model.initial_exponents": ("auto", 9.0), "model.initial_illumination": "auto"}
+    )
+    run = fit(dataset, config)
+    exponent, _ = run.config.model.initial_exponents
+    assert 1 < exponent <= 2
+    assert 0 < run.config.model.initial_illumination < 1
+    assert not run.moving
+
+
+def test_views_that_cannot_be_shared(dataset):
+    with pytest.raises(ValueError, match="devices are wanted"):
+        fit(dataset, tiny(batch_size=64), device_count=64)
+    with pytest.raises(UserError, match="at least one step"):
+        fit(dataset, tiny(coarse_steps=0, fine_steps=0))
+
+
+def test_views_of_any_size_and_instant(dataset, quick):
+    run = fit(dataset, tiny(coarse_steps=1, fine_steps=1, density=PRESETS["default"].density))
+    camera = dataset.test.camera(2)
+    view = run.render(camera)
+    assert view.images.welllit.shape == (dataset.height, dataset.width, 3)
+    wide = run.render(camera, width=dataset.width + 8)
+    assert wide.alpha.shape == (dataset.height, dataset.width + 8)
+    assert np.abs(wide.alpha[:, : dataset.width] - view.alpha).mean() < 0.02
+    assert run.renderer() is run.renderer(dataset.width, dataset.height)

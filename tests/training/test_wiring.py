@@ -1,0 +1,205 @@
+"""Every schedule reaches the step that it is meant for: the numbers of a whole run, not only the formulas."""
+
+import dataclasses
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from tiny_training import make_dataset, tiny
+
+from l2dgs_jax.config import DensityConfig, overrides
+from l2dgs_jax.model import hexplane
+from l2dgs_jax.runtime import devices
+from l2dgs_jax.training import engine, initial_state, step
+from l2dgs_jax.training.batching import view_indices
+from l2dgs_jax.training.parameter_groups import groups
+
+COARSE, FINE = 10, 15
+
+
+@pytest.fixture(scope="module")
+def dataset():
+    return make_dataset()
+
+
+def config_of(**changes):
+    return overrides.replace(tiny(coarse_steps=COARSE, fine_steps=FINE, sh_warmup=4), changes)
+
+
+def batch_of(dataset):
+    return jax.tree.map(lambda x: jnp.asarray(x, float), engine.load_batch(dataset.train, np.array([0, 3])))
+
+
+def what_the_objective_passes_on(dataset, monkeypatch, config, at, moving):
+    """The exponent of Eq. 10, the target of B1's prior, and the SH bands that a step of that number uses."""
+    seen = {}
+    render, total = step.render, step.losses.total
+
+    def spy_on_render(*arguments, **options):
+        seen["sh_degree"] = options["sh_degree"]
+        return render(*arguments, **options)
+
+    def spy_on_total(output, target, cfg, eta, exponent_target):
+        seen.update(eta=eta, exponent_target=exponent_target)
+        return total(output, target, cfg, eta, exponent_target)
+
+    monkeypatch.setattr(step, "render", spy_on_render)
+    monkeypatch.setattr(step.losses, "total", spy_on_total)
+    state, batch = initial_state(dataset, config), batch_of(dataset)
+    probe = jnp.zeros((2, len(state.scene.alive), 2))
+
+    @jax.jit
+    def look(number):
+        step.objective(state.scene.params, probe, state._replace(step=number), batch, config, moving, 4096)
+        return dict(seen)
+
+    return {name: float(value) for name, value in look(jnp.int32(at)).items()}
+
+
+# Over the whole run 0.9 falls to 0.4; if it restarts, it does so within either stage.
+@pytest.mark.parametrize(
+    ("restarts", "at", "progress"),
+    [
+        (False, 0, 0),
+        (False, 6, 6 / 25),
+        (False, COARSE, 10 / 25),
+        (False, 20, 20 / 25),
+        (True, 6, 6 / 10),
+        (True, COARSE, 0),
+        (True, 16, 6 / 15),
+    ],
+)
+def test_the_exponent_of_the_tone_curve(dataset, monkeypatch, restarts, at, progress):
+    config = config_of(**{"loss.eta_start": 0.9, "loss.eta_end": 0.4, "loss.eta_restarts": restarts})
+    seen = what_the_objective_passes_on(dataset, monkeypatch, config, at, at >= COARSE)
+    np.testing.assert_allclose(seen["eta"], 0.9 * (0.4 / 0.9) ** progress, rtol=1e-6)
+
+
+@pytest.mark.parametrize(("at", "degree"), [(0, 0), (3, 0), (4, 1), (8, 2), (11, 2), (24, 3)])
+def test_the_bands_of_the_illumination(dataset, monkeypatch, at, degree):
+    config = config_of()
+    config = dataclasses.replace(config, model=dataclasses.replace(config.model, sh_degree=3))
+    seen = what_the_objective_passes_on(dataset, monkeypatch, config, at, at >= COARSE)
+    assert seen["sh_degree"] == degree
+
+
+@pytest.mark.parametrize(("exponents", "target"), [((1.7, 9.0), 1.7), (None, 1.0)])
+def test_the_prior_of_the_exponent_pulls_to_its_start(dataset, monkeypatch, exponents, target):
+    config = config_of(**{"model.initial_exponents": exponents})
+    assert what_the_objective_passes_on(dataset, monkeypatch, config, 0, False)["exponent_target"] == target
+
+
+def test_the_planes_are_smoothed_in_the_fine_stage_only(dataset):
+    weights = {"loss.plane_smoothness": 2.0, "loss.time_smoothness": 3.0, "loss.time_l1": 5.0}
+    config, batch = config_of(**weights), batch_of(dataset)
+    state = initial_state(dataset, config)
+    planes = jax.tree.map(lambda x: jax.random.normal(jax.random.key(0), x.shape), state.scene.params.hexplane)
+    params = state.scene.params._replace(hexplane=planes)
+    probe = jnp.zeros((2, len(state.scene.alive), 2))
+
+    @jax.jit
+    def added(state):
+        plain = overrides.replace(config, dict.fromkeys(weights, 0.0))
+        loss = lambda config, moving: step.objective(params, probe, state, batch, config, moving, 4096)[0]
+        return [loss(config, moving) - loss(plain, moving) for moving in (False, True)]
+
+    coarse, fine = added(state)
+    assert coarse == 0
+    np.testing.assert_allclose(fine, np.dot([2, 3, 5], hexplane.regularisers(planes)), rtol=1e-9)
+
+
+@pytest.fixture
+def journal(monkeypatch):
+    """What `engine.run` does at which step, without any training."""
+    entries = SimpleNamespace(steps=[], stages=[], growths=[])
+
+    def take(states, batches, values, number, *, config, moving, pair_capacity, mesh):
+        entries.steps.append((number, moving, np.asarray(batches.cameras.time)[0].tolist()))
+        report = step.StepReport(*[jnp.zeros(1)] * 6)
+        return states._replace(step=states.step + 1), report, engine.Tally(0, 1)
+
+    begin = engine.begin_fine_stage
+
+    def begin_fine_stage(states, values, number, **options):
+        entries.stages.append(number)
+        return begin(states, values, number, **options)
+
+    def densify_all(states, values, number, **_):
+        entries.growths.append(number)
+        return states
+
+    monkeypatch.setattr(engine, "train_steps", take)
+    monkeypatch.setattr(engine, "begin_fine_stage", begin_fine_stage)
+    monkeypatch.setattr(engine, "densify_all", densify_all)
+    return entries
+
+
+def run(dataset, config, state=None):
+    member = engine.Member(dataset.train, config, initial_state(dataset, config) if state is None else state)
+    return [(p.step, jax.tree.map(np.asarray, devices.member(p.states, 0))) for p in engine.run([member], 4096)]
+
+
+def test_stages_views_and_growth_of_a_run(dataset, journal):
+    density = DensityConfig(start=2, stop=9, interval=3)
+    config = dataclasses.replace(config_of(seed=5), density=density)
+    states = dict(run(dataset, config))
+    assert [number for number, _, _ in journal.steps] == list(range(COARSE + FINE))
+    assert [moving for _, moving, _ in journal.steps] == [False] * COARSE + [True] * FINE
+    times = dataset.train.cameras.time
+    for number, _, shown in journal.steps:
+        np.testing.assert_array_equal(shown, times[view_indices(5, number, config.batch_size, len(times))])
+    assert journal.stages == [COARSE]
+    assert journal.growths == [3, 6, COARSE + 3, COARSE + 6]  # counted from the start of each stage
+    assert states[COARSE + FINE].step == COARSE + FINE
+
+
+def test_growth_that_never_starts(dataset, journal):
+    run(dataset, dataclasses.replace(config_of(), density=DensityConfig(start=2, stop=0, interval=3)))
+    assert journal.growths == []
+
+
+@pytest.mark.parametrize(("decay_steps", "coarse", "fine"), [(None, COARSE, FINE), (7, 7, 7)])
+def test_rates_decay_over_their_stage(dataset, journal, decay_steps, coarse, fine):
+    config = config_of(**{"optim.decay_steps": decay_steps})
+    states = dict(run(dataset, config))
+    extent = float(states[1].scene.extent)
+    for number, length in ((1, coarse), (COARSE, coarse), (COARSE + 1, fine), (COARSE + FINE, fine)):
+        schedules = states[number].adam.schedules
+        assert {float(schedule.steps) for schedule in schedules.values()} == {length}
+        np.testing.assert_allclose(schedules["means"].start, config.optim.means_lr * extent)
+        np.testing.assert_allclose(schedules["bafe"].start, config.optim.bafe_lr)
+
+
+def test_the_optimizer_starts_anew_with_the_fine_stage_and_not_when_a_run_goes_on(dataset, journal):
+    config = config_of()
+    state = initial_state(dataset, config)
+    used = jax.tree.map(lambda x: x + 1 if x.dtype == float else x, state.adam.mu)
+    state = state._replace(adam=state.adam._replace(mu=used, step=jnp.int32(4)), step=jnp.int32(4))
+    states = dict(run(dataset, config, state))
+    assert min(states) == 5
+    assert states[COARSE].adam.step == 4
+    assert states[COARSE].adam.mu.gaussians.means.max() == 1
+    assert states[COARSE + 1].adam.step == 0
+    assert not any(x.any() for x in jax.tree.leaves(states[COARSE + 1].adam.mu))
+
+
+def test_every_rate_moves_its_parameters_and_no_others(dataset):
+    config = config_of()
+    state, batch = initial_state(dataset, config), batch_of(dataset)
+    leaves, treedef = jax.tree.flatten(state.scene.params)
+    keys = jax.random.split(jax.random.key(0), len(leaves))
+    leaves = [x + 0.03 * jax.random.normal(key, x.shape) for x, key in zip(leaves, keys, strict=True)]
+    params = treedef.unflatten(leaves)
+    state = state._replace(scene=state.scene._replace(params=params), step=jnp.int32(20))
+    take = jax.jit(lambda state: step.train_step(state, batch, config, moving=True, pair_capacity=4096)[0])
+    labels = jax.tree.leaves(groups(params))
+    for name in state.adam.schedules:
+        rates = {
+            group: schedule._replace(start=jnp.asarray(1e-3 if group == name else 0.0))
+            for group, schedule in state.adam.schedules.items()
+        }
+        after = take(state._replace(adam=state.adam._replace(schedules=rates))).scene.params
+        moved = {label for label, x, y in zip(labels, leaves, jax.tree.leaves(after), strict=True) if np.any(x != y)}
+        assert moved == {name}
