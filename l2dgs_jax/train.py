@@ -19,7 +19,7 @@ from l2dgs_jax.runs import Checkpoint, Recorder, Run, checkpoints
 from l2dgs_jax.runtime import command_line, devices, distributed
 from l2dgs_jax.runtime.distributed import Hosts
 from l2dgs_jax.runtime.files import is_taken
-from l2dgs_jax.training import DivergedError, Progress, resolve
+from l2dgs_jax.training import DivergedError, Progress, initial_state, resolve
 from l2dgs_jax.visualize import contact_sheet, write_run_video
 
 
@@ -61,7 +61,10 @@ def _train(options: Train) -> None:
     _check_devices(options)
     dataset = load_dataset(options.scene, config.downscale, config.format, config.held_out, config.frame_memory)
     config = resolve(config, dataset.train)
-    start = checkpoints.load(folder / runs.CHECKPOINT, config, len(dataset.train.names)) if options.resume else None
+    if options.resume:
+        start = checkpoints.load(folder / runs.CHECKPOINT, config, len(dataset.train.names))
+    else:
+        start = Checkpoint(initial_state(dataset, config))  # what cannot start should leave no folder
     distributed.barrier("everything is read")
     if jax.process_index() > 0:
         runs.fit(dataset, config, start=start, device_count=options.devices)
@@ -70,11 +73,11 @@ def _train(options: Train) -> None:
     distributed.barrier("the run is finished")
 
 
-def _record(dataset: Dataset, options: Train, config: Config, start: Checkpoint | None) -> None:
+def _record(dataset: Dataset, options: Train, config: Config, start: Checkpoint) -> None:
     """Train, leave the steps in the run folder, and show what came of them."""
     folder = options.output
     assert folder is not None
-    if start is None:
+    if not options.resume:
         runs.write_settings(folder, options.scene, config)
     for note in dataset.notes:
         print(f"note: {note}")
@@ -91,8 +94,8 @@ def _record(dataset: Dataset, options: Train, config: Config, start: Checkpoint 
     print(f"next: python -m l2dgs_jax.evaluate {folder}   or   python -m l2dgs_jax.render {folder}")
 
 
-def _fit_with_progress(dataset: Dataset, options: Train, config: Config, start: Checkpoint | None) -> Run:
-    folder, done = options.output, int(start.state.step) if start else 0
+def _fit_with_progress(dataset: Dataset, options: Train, config: Config, start: Checkpoint) -> Run:
+    folder, done = options.output, int(start.state.step)
     assert folder is not None
     record = Recorder(folder, config, done)
     with tqdm(total=config.steps, initial=done, unit="step", dynamic_ncols=True) as bar:
@@ -134,7 +137,10 @@ def _parse(arguments: Sequence[str]) -> Train:
 def _run_folder(scene: str, resume: bool) -> Path:
     """runs/NAME, runs/NAME-2 ...: the first that is free, or with `resume` the last that is not."""
     name, taken = Path(scene).name, 0
-    candidate = lambda index: Path("runs") / (name if index == 1 else f"{name}-{index}")
+
+    def candidate(index: int) -> Path:
+        return Path("runs") / (name if index == 1 else f"{name}-{index}")
+
     while candidate(taken + 1).exists():
         taken += 1
     if resume and not taken:
@@ -144,9 +150,8 @@ def _run_folder(scene: str, resume: bool) -> Path:
 
 def _check_devices(options: Train) -> None:
     """Complain early if the views of a step cannot be spread over as many devices as wanted."""
-    views, count = options.config.batch_size, options.devices
-    if count is None:
-        return
+    views = options.config.batch_size
+    count = devices.shares(views) if options.devices is None else options.devices
     if count < 1 or views % count:
         raise UserError(f"--devices {count}: expected a number that divides --batch-size, which is {views}")
     try:

@@ -1,4 +1,4 @@
-"""Data moves one way: every floor uses only what stands above it."""
+"""Data moves one way: every layer uses only what comes before it."""
 
 import ast
 from pathlib import Path
@@ -25,13 +25,13 @@ FOLDERS = (
     "study",
 )
 COMMANDS = ("train", "evaluate", "render", "sweep", "prepare", "convert", "masks", "simulate")
-FLOORS = (*VOCABULARY, *FOLDERS, "commands")
+LAYERS = (*VOCABULARY, *FOLDERS, "commands")
 TOUCH_FILES = ("runtime", "data", "runs", "visualize", "preprocess", "study", "commands")
 MODULES = [path for path in PACKAGE.rglob("*.py") if path not in (PACKAGE / "__init__.py", PACKAGE / "__main__.py")]
 each_module = pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(PACKAGE)))
 
 
-def floor(path):
+def layer(path):
     name = path.relative_to(PACKAGE).parts[0].removesuffix(".py")
     return "commands" if name in COMMANDS else name
 
@@ -49,7 +49,7 @@ def imported_modules(path):
         yield from (name.removeprefix("l2dgs_jax.") for name in names if name.startswith("l2dgs_jax."))
 
 
-def test_every_place_has_its_floor():
+def test_every_file_and_folder_has_its_layer():
     files = {path.stem for path in PACKAGE.glob("*.py")}
     folders = {path.name for path in PACKAGE.iterdir() if path.is_dir() and path.name != "__pycache__"}
     assert files == {*VOCABULARY, *COMMANDS, "__init__", "__main__"}
@@ -58,11 +58,32 @@ def test_every_place_has_its_floor():
 
 @each_module
 def test_imports_go_one_way(path):
-    own = FLOORS.index(floor(path))
+    own = LAYERS.index(layer(path))
     used = {name.split(".")[0] for name in imported_modules(path)}
     assert not used & set(COMMANDS), "commands are not imported"
-    below = {name for name in used if FLOORS.index(name) > own}
-    assert not below, f"{floor(path)} imports {below}, which come after it"
+    below = {name for name in used if LAYERS.index(name) > own}
+    assert not below, f"{layer(path)} imports {below}, which come after it"
+
+
+def module_of(name):
+    """The file that an imported name lies in."""
+    parts = name.split(".")
+    for end in range(len(parts), 0, -1):
+        base = PACKAGE.joinpath(*parts[:end])
+        if base.with_suffix(".py").exists():
+            return base.with_suffix(".py")
+        if end == len(parts) - 1 and (base / "__init__.py").exists():
+            return base / "__init__.py"
+    return None
+
+
+def test_no_file_imports_itself_in_a_circle():
+    waiting = {path: {module_of(name) for name in imported_modules(path)} & set(MODULES) - {path} for path in MODULES}
+    while waiting:
+        ready = [path for path, used in waiting.items() if not used & waiting.keys()]
+        assert ready, f"a circle among {sorted(str(path.relative_to(PACKAGE)) for path in waiting)}"
+        for path in ready:
+            del waiting[path]
 
 
 @each_module
@@ -71,14 +92,14 @@ def test_jaxopt_and_files_stay_where_they_belong(path):
     if path != PACKAGE / "training" / "optimizer.py":
         assert "import jaxopt" not in source
         assert "from jaxopt" not in source
-    if floor(path) not in TOUCH_FILES:
+    if layer(path) not in TOUCH_FILES:
         assert "open(" not in source
         assert "pathlib" not in source
 
 
 @each_module
 def test_the_compilers_attributes_stay_in_one_folder(path):
-    if floor(path) != "kernels":
+    if layer(path) != "kernels":
         assert f"xla_{'cpu'}" not in path.read_text()
 
 

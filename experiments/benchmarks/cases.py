@@ -33,7 +33,7 @@ from l2dgs_jax.types import Camera, MovedGaussians, RenderOutput, Scene
 Figures = dict[str, float]
 
 DEFAULT = PRESETS["default"]
-# What `engine.resolve` would take from the frames; it costs the same whatever they are.
+# What `training.resolve` would take from the frames; it costs the same whatever they are.
 CONFIG = dataclasses.replace(
     DEFAULT, model=dataclasses.replace(DEFAULT.model, initial_exponents=(2.0, 9.0), initial_illumination=0.9)
 )

@@ -11,7 +11,6 @@ import jax
 import numpy as np
 
 from l2dgs_jax import open_run
-from l2dgs_jax.cameras.geometry import select_camera
 from l2dgs_jax.data.images import to_bytes, write_image
 
 GAP = 6  # pixels
@@ -28,7 +27,7 @@ def main() -> None:
     split, renderer = run.dataset.test, run.renderer()
     rows = []
     for i in np.linspace(0, len(split.names) - 1, options.views + 2).round().astype(int)[1:-1]:
-        images = jax.device_get(renderer(select_camera(split.cameras, int(i)))).images
+        images = jax.device_get(renderer(split.camera(int(i)))).images
         pictures = [to_bytes(x) for x in (split.images[i], images.lowlight, images.welllit)]
         rows.append(np.hstack([np.pad(p, ((0, GAP), (0, GAP), (0, 0)), constant_values=255) for p in pictures]))
     figure = np.vstack(rows)[:-GAP, :-GAP]

@@ -28,8 +28,13 @@ def select_camera(cameras: Camera, index: int) -> Camera:
     return Camera(*(x[index] for x in cameras))
 
 
-def resize(camera: Camera, factor: float) -> Camera:
-    """The same view in an image `factor` times as wide and as high; exact, because pixel centres lie at +0.5."""
+def resize(camera: Camera, factor: float | int) -> Camera:
+    """The same view in an image `factor` times as wide and as high; exact, because pixel centres lie at +0.5.
+
+    Args:
+        camera: one camera, or a batch of them.
+        factor: on the width and the height in pixels.
+    """
     scale: Float[np.ndarray, "3 1"] = np.array([[factor], [factor], [1.0]])
     K = jnp.asarray(camera.K)
     return camera._replace(K=K * jnp.asarray(scale, K.dtype).reshape(*[1] * (K.ndim - 2), 3, 1))

@@ -44,6 +44,21 @@ TRACEABLE: dict[Any, Any] = {
 }
 
 EPS = math.exp(-5)  # of Eq. 10
+# Parameters that share a learning rate.
+RATE_GROUPS = (
+    "means",
+    "heads",
+    "planes",
+    "ocd",
+    "bafe",
+    "illumination",
+    "illumination_rest",
+    "reflectance",
+    "attenuation",
+    "opacities",
+    "scales",
+    "quats",
+)
 
 
 @dataclass(frozen=True)
@@ -61,10 +76,10 @@ class ModelConfig:
     opacity_head: bool = False  # a fourth head moves the opacity's logit, as 4DGS can (arXiv 2310.08528)
     identity_start: bool = False  # heads and OCD-Net start as "no motion, a_j = 1" instead of at random
     illumination_offset: Number = 0.5  # l = max(offset + sum a_j b_j B_j, 0)
-    # N(0, 1), U(0, 1), or the frames' colours at the points, with the darkening of tone.py undone
+    # N(0, 1), U(0, 1), or the frames' colours at the points, with the darkening of model/tone.py undone
     reflectance_init: Literal["normal", "uniform", "observed"] = "uniform"
     attenuation_init: Literal["normal", "uniform"] = "uniform"
-    # B1, B2 that BAFE-Net starts at; None: zero bias, 5.5. B1 "auto": what the frames' darkness implies (tone.py)
+    # B1, B2 that BAFE-Net starts at; None: zero bias, 5.5. B1 "auto": what the frames' darkness implies (model/tone.py)
     initial_exponents: Exponents = None
     # l of every Gaussian at the start; None: luminance of the points. "auto": what makes L^B2 the darkening's gain
     initial_illumination: Illumination = None
@@ -115,7 +130,11 @@ class OptimConfig:
     ocd_lr_end: Number = 1.6e-5
     bafe_lr: Number = 1.6e-3
     bafe_lr_end: Number = 1.6e-4
-    extent_scales: tuple[str, ...] = ("means", "heads", "planes")  # groups whose rates are multiplied by the extent
+    extent_scales: tuple[str, ...] = (
+        "means",
+        "heads",
+        "planes",
+    )  # RATE_GROUPS whose rates the extent multiplies
     illumination_lr: Number = 2.5e-3
     illumination_rest_divisor: Number = 20.0
     reflectance_lr: Number = 1e-5
@@ -127,6 +146,11 @@ class OptimConfig:
     beta1: Number = 0.9
     beta2: Number = 0.999
     eps: Number = 1e-15
+
+    def __post_init__(self) -> None:
+        unknown = sorted(set(self.extent_scales) - set(RATE_GROUPS))
+        if unknown:
+            raise UserError(f"--optim.extent-scales {unknown[0]}: expected some of {', '.join(RATE_GROUPS)}")
 
 
 @dataclass(frozen=True)

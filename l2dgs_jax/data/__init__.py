@@ -1,5 +1,6 @@
 """Scenes on disk to arrays in memory, and back."""
 
+import dataclasses
 import zipfile
 from pathlib import Path
 from types import ModuleType
@@ -8,7 +9,7 @@ import numpy as np
 
 from l2dgs_jax.config import Config
 from l2dgs_jax.data import colmap, demo, llff, nerfies, splits, transforms
-from l2dgs_jax.data.dataset import Dataset, Split
+from l2dgs_jax.data.dataset import Dataset, Source, Split
 from l2dgs_jax.errors import UserError
 
 __all__ = ["LAYOUTS", "Dataset", "Split", "load_dataset"]
@@ -41,6 +42,8 @@ def load_dataset(
     if not frame_memory >= 0:
         raise UserError(f"--frame-memory {frame_memory}: expected GiB, from 0")
     splits.check_rule(held_out)
+    name = "demo" if scene == "demo" else str(Path(scene).absolute())
+    source = Source(name, downscale, format, held_out, float(frame_memory))
     folder = demo.FOLDER if scene == "demo" else Path(scene)
     if format not in ("auto", *LAYOUTS):
         raise UserError(f"--format {format}: no such layout; expected auto, {', '.join(LAYOUTS)}")
@@ -52,9 +55,10 @@ def load_dataset(
         if format == "auto":
             format = _recognized(folder)
         with np.errstate(all="ignore"):  # `assemble` complains of what has overflown
-            return LAYOUTS[format].read(folder, downscale, held_out, frame_memory)
+            dataset = LAYOUTS[format].read(folder, downscale, held_out, frame_memory)
     except OSError as error:
         raise UserError(f"{error.filename or folder}: {error.strerror}; expected files that can be read") from None
+    return dataclasses.replace(dataset, source=source)
 
 
 def _recognized(folder: Path) -> str:

@@ -154,9 +154,9 @@ class _SplitReader:
     def read(self) -> tuple[Split, list[str]]:
         """The split, with notes; truth and masks that no frame has are None."""
         lowlight, valid = self._lowlight()
-        welllit, well_note = self._truth("well", bool_mask=False)
-        masks, mask_note = self._truth("mask", bool_mask=True)
-        covisible, covisible_note = self._truth("covisible", bool_mask=True, prefix=f"{self.part}/")
+        welllit, well_note = self._truth("well", as_mask=False)
+        masks, mask_note = self._truth("mask", as_mask=True)
+        covisible, covisible_note = self._truth("covisible", as_mask=True, prefix=f"{self.part}/")
         K = [scale_intrinsics(without_skew(frame.K), self.downscale) for frame in self.frames]
         split = Split(
             names=tuple(frame.name for frame in self.frames),
@@ -210,10 +210,10 @@ class _SplitReader:
             counts = counts & (self._fit(frame, (alpha > 0.5).astype(np.float32), scale)[..., 0] > 0.999)
         return self._fit(frame, image, scale).astype(np.float16), counts
 
-    def _truth(self, kind: str, bool_mask: bool, prefix: str = "") -> tuple[Any, str]:
+    def _truth(self, kind: str, as_mask: bool, prefix: str = "") -> tuple[Any, str]:
         """What lies in a folder beside the layout's own, as images or as masks, and a note if it cannot be used."""
         names = [prefix + frame.name for frame in self.frames]
-        found, note = stored_if_any(self.folder / kind, self.downscale, names, all_or_none=not bool_mask)
+        found, note = stored_if_any(self.folder / kind, self.downscale, names, all_or_none=not as_mask)
         if not found:
             return None, note
         _check_pictures(found, self.frames[0].size)
@@ -221,10 +221,10 @@ class _SplitReader:
         def read_one(index: int) -> Float16[np.ndarray, "H W 3"] | Bool[np.ndarray, "H W"]:
             picture = found[index]
             image = self._fit(self.frames[index], images.read_image(picture.path), picture.scale).astype(np.float16)
-            return image.mean(-1) > 0.5 if bool_mask else image
+            return image.mean(-1) > 0.5 if as_mask else image
 
         read_all = _parallel(read_one, range(len(self.frames)))
-        return self._stack(read_all, bool) if bool_mask else self._stack(read_all, np.float16, 3), note
+        return self._stack(read_all, bool) if as_mask else self._stack(read_all, np.float16, 3), note
 
     def _fit(self, frame: Frame, image: Float32[np.ndarray, "h w C"], scale: int) -> Float32[np.ndarray, "H W C"]:
         """A picture that is already `scale` times smaller, undistorted, at the size wanted."""

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -11,6 +11,29 @@ from l2dgs_jax.cameras.geometry import select_camera
 from l2dgs_jax.data.lens import Lens
 from l2dgs_jax.data.stacks import pixel_mean
 from l2dgs_jax.types import Camera
+
+
+class Source(NamedTuple):
+    """What `load_dataset` was asked for; `Config` has settings of the same names.
+
+    Attributes:
+        scene: absolute path of its folder, or "demo".
+        downscale: see `load_dataset`, as the others.
+        format: likewise.
+        held_out: likewise.
+        frame_memory: likewise.
+    """
+
+    scene: str
+    downscale: int
+    format: str
+    held_out: str
+    frame_memory: float
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """All but the scene, by their names in `Config`."""
+        return {name: value for name, value in self._asdict().items() if name != "scene"}
 
 
 class Original(NamedTuple):
@@ -74,6 +97,7 @@ class Dataset:
         points: where the scene has surfaces, world units.
         colors: sRGB values in [0, 1] of the points, if known.
         notes: sentences on what the reader assumed because the files do not say it.
+        source: where it was read from; None if it was made otherwise.
     """
 
     name: str
@@ -84,3 +108,4 @@ class Dataset:
     points: Float[np.ndarray, "P 3"]
     colors: Float[np.ndarray, "P 3"] | None = None
     notes: tuple[str, ...] = ()
+    source: Source | None = None

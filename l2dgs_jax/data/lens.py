@@ -64,7 +64,7 @@ def undistort(
     """
     if lens.is_pinhole and K[0, 1] == 0:
         return image
-    columns, rows = _places(image.shape[1], image.shape[0], tuple(K[:2].ravel().tolist()), lens)
+    columns, rows = _positions(image.shape[1], image.shape[0], tuple(K[:2].ravel().tolist()), lens)
     warped = cv2.remap(image, columns, rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     return np.clip(warped.reshape(image.shape), 0, 1)  # cubic interpolation overshoots
 
@@ -115,7 +115,7 @@ def _polynomial(coefficients: tuple[float, ...], s: Float[np.ndarray, "*S"]) -> 
 
 
 @functools.lru_cache(maxsize=4)  # most scenes have one camera
-def _places(
+def _positions(
     width: int, height: int, K: tuple[float, ...], lens: Lens
 ) -> tuple[Float32[np.ndarray, "H W"], Float32[np.ndarray, "H W"]]:
     """What to ask cv2's cubic interpolation for to get the pixels of the straight picture from the distorted one."""
@@ -156,8 +156,8 @@ def _origins(
         for _ in range(_SOLVER_STEPS):
             lens_x, lens_y = distort(lens, straight_x, straight_y)
             straight_x, straight_y = straight_x + x - lens_x, straight_y + y - lens_y
-        places = fx * straight_x + cx - 0.5, fy * straight_y + cy - 0.5
-    columns, rows = (np.nan_to_num(place, nan=-8, posinf=-8, neginf=-8).astype(np.float32) for place in places)
+        positions = fx * straight_x + cx - 0.5, fy * straight_y + cy - 0.5
+    columns, rows = (np.nan_to_num(place, nan=-8, posinf=-8, neginf=-8).astype(np.float32) for place in positions)
     return columns, rows
 
 
@@ -169,8 +169,8 @@ _SOLVER_STEPS = 40
 _OFFSETS = (0.5 + np.sinh(np.arcsinh(4 * np.linspace(0, 1, 4097) - 2) / 3)).astype(np.float32)
 
 
-def _for_cubic(places: Float32[np.ndarray, "H W"], length: int) -> Float32[np.ndarray, "H W"]:
-    """What to ask cv2's cubic interpolation for to get the values at `places`; far ones come near the border."""
-    places = np.clip(np.nan_to_num(places, nan=-8), -8, length + 8)
-    whole = np.floor(places)
-    return whole + _OFFSETS[np.rint(4096 * (places - whole)).astype(np.int32)]
+def _for_cubic(positions: Float32[np.ndarray, "H W"], length: int) -> Float32[np.ndarray, "H W"]:
+    """What to ask cv2's cubic interpolation for to get the values at `positions`; far ones come near the border."""
+    positions = np.clip(np.nan_to_num(positions, nan=-8), -8, length + 8)
+    whole = np.floor(positions)
+    return whole + _OFFSETS[np.rint(4096 * (positions - whole)).astype(np.int32)]

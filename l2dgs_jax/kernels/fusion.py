@@ -13,7 +13,7 @@ from l2dgs_jax.kernels.selection import by_form, chosen_form
 T = TypeVar("T")
 
 
-def separate(function: Callable[..., T], like: Any = None) -> Callable[..., T]:
+def unfused_on_cpu(function: Callable[..., T], like: Any = None) -> Callable[..., T]:
     """The same function, on CPU not fused with what calls it (see `unfused`). Without gradients of its own.
 
     Args:
@@ -29,20 +29,22 @@ def separate(function: Callable[..., T], like: Any = None) -> Callable[..., T]:
 
 
 def fusion_boundary(function: Callable[..., T]) -> Callable[..., T]:
-    """The same function; on CPU it is kept `separate`, and so is its gradient, computed from the arguments.
+    """The same function of floats; on CPU it is kept apart, and so is its gradient, computed from the arguments.
 
     For long arithmetic with many results: divided by such boundaries, little of it is computed more than once. With a
-    boundary, gradients are reverse mode only. Where an accelerator is, or a form other than "cpu" is set, it is the
-    function itself.
+    boundary, gradients are reverse mode only. Where jax's default backend is no CPU, or a form other than "cpu" is set,
+    it is the function itself.
     """
 
     @jax.custom_vjp
     def bounded(*arguments: Any) -> T:
-        return separate(function)(*arguments)
+        return unfused_on_cpu(function)(*arguments)
 
     def backward(arguments: Any, cotangent: Any) -> Any:
-        pull = lambda arguments, cotangent: jax.vjp(function, *arguments)[1](cotangent)
-        return separate(pull, like=arguments)(arguments, cotangent)
+        def pull(arguments: Any, cotangent: Any) -> Any:
+            return jax.vjp(function, *arguments)[1](cotangent)
+
+        return unfused_on_cpu(pull, like=arguments)(arguments, cotangent)
 
     bounded.defvjp(lambda *arguments: (bounded(*arguments), arguments), backward)
 

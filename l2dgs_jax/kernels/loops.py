@@ -1,4 +1,4 @@
-"""Reading and writing of arrays inside of loops, in the forms that XLA does in place."""
+"""Reading and writing of arrays inside of loops, by operations that XLA performs in place."""
 
 from collections.abc import Callable
 from typing import TypeVar

@@ -12,6 +12,7 @@ import numpy as np
 from jax.extend.core import Primitive
 from jax.interpreters import batching, mlir
 
+from l2dgs_jax.errors import UserError
 from l2dgs_jax.kernels.compilation import TRIED, VERSION
 
 Form = Literal["reference", "cpu", "accelerator"]
@@ -21,21 +22,18 @@ VARIABLE = "L2DGS_JAX_KERNELS"  # of the environment: the form of a whole proces
 T = TypeVar("T")
 
 
-def _from_environment() -> Form | None:
-    value = os.environ.get(VARIABLE) or None
-    if value not in (None, *FORMS):
-        raise ValueError(f"{VARIABLE} is {value!r}; expected one of {', '.join(FORMS)}")
-    return value
-
-
 # Part of the key under which jax caches what it has traced and compiled.
-_setting = jax.make_user_context(default_value=_from_environment())
+_UNSET = "unset"
+_setting = jax.make_user_context(default_value=_UNSET)
 
 
 def use_kernels(form: str | None) -> contextlib.AbstractContextManager[None]:
     """A context in which every operation takes this form, whatever it is compiled for; None: the platform decides.
 
     The environment variable L2DGS_JAX_KERNELS sets the same for a whole process.
+
+    Args:
+        form: "reference", "cpu" or "accelerator".
 
     Raises:
         ValueError: there is no such form.
@@ -46,8 +44,28 @@ def use_kernels(form: str | None) -> contextlib.AbstractContextManager[None]:
 
 
 def chosen_form() -> Form | None:
-    """The explicit setting, if there is one."""
-    return _setting.value
+    """The explicit setting, if there is one.
+
+    Raises:
+        UserError: the environment names another form.
+    """
+    return _from_environment() if _setting.value == _UNSET else _setting.value
+
+
+@functools.cache
+def _from_environment() -> Form | None:
+    value = os.environ.get(VARIABLE) or None
+    if value not in (None, *FORMS):
+        raise UserError(f"{VARIABLE} is {value!r}; expected one of {', '.join(FORMS)}, or nothing")
+    return value
+
+
+def functions_by_form(
+    name: str, *, reference: Any, cpu: Any, accelerator: Any, **static: Any
+) -> dict[str, Callable[..., Any]]:
+    """The functions of one name in the modules of the forms, for `by_form`, given what is fixed at compilation."""
+    modules = {"reference": reference, "cpu": cpu, "accelerator": accelerator}
+    return {form: functools.partial(getattr(module, name), **static) for form, module in modules.items()}
 
 
 def by_form(
@@ -57,7 +75,7 @@ def by_form(
 
     Without an explicit setting nothing is traced before it is known which platform the program is lowered for:
     programs for a CPU contain `cpu`, if this compiler was tried with it, and all others `accelerator`. Carries no
-    gradients then: callers define their own.
+    gradients then: callers define their own. Not for `jax.shard_map` that checks what varies over a mesh.
 
     Args:
         *arguments: PyTrees of arrays.
@@ -117,7 +135,10 @@ def _batch(
 ) -> tuple[list[Any], list[int]]:
     size = next(x.shape[axis] for x, axis in zip(leaves, axes, strict=True) if axis is not None)
     in_axes = tuple(axes)  # None where all members share an argument
-    batched = lambda function: jax.vmap(function, in_axes=in_axes, axis_size=size)
+
+    def batched(function: Callable) -> Callable:
+        return jax.vmap(function, in_axes=in_axes, axis_size=size)
+
     results = _by_platform.bind(
         *leaves,
         cpu=batched(cpu),

@@ -11,7 +11,7 @@ MIN_TRANSMITTANCE = 1e-4  # a Gaussian that would leave this little light ends i
 
 
 class Tiling(NamedTuple):
-    """What is static about a list of pairs: views, columns and rows of tiles in each, and pairs that it can hold."""
+    """Sizes of a list of pairs: views, columns and rows of tiles in each, and how many pairs it can hold."""
 
     views: int
     columns: int

@@ -1,4 +1,4 @@
-"""Image quality: PSNR and SSIM, their masked forms, and the scores of a held-out split."""
+"""Image quality: PSNR and SSIM, and their masked forms."""
 
 from typing import Literal
 
@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from l2dgs_jax.kernels.fusion import separate
+from l2dgs_jax.kernels.fusion import unfused_on_cpu
 
 RADIUS = 5  # of the 11x11 SSIM window
 SIGMA = 1.5  # pixels
@@ -99,7 +99,7 @@ def psnr(
 ) -> Float[Array, "*B"]:
     """Peak signal to noise ratio in dB for values in [0, 1], of the pixels in `mask` (mPSNR, arXiv 2210.13445).
 
-    Infinite for equal images, NaN where the mask is empty.
+    Infinite for equal images, NaN where the mask is empty. Gradients flow to both images.
     """
     error = (a - b) ** 2
     return -10 * jnp.log10(error.mean((-3, -2, -1)) if mask is None else _masked_mean(error, mask))
@@ -121,6 +121,6 @@ def _window_mean(images: Float[Array, "*B H W C"]) -> Float[Array, "*B H W C"]:
     return along(-2, along(-3, images))
 
 
-_blur = jax.custom_vjp(separate(_window_mean))
+_blur = jax.custom_vjp(unfused_on_cpu(_window_mean))
 # A symmetric window is its own transpose; the transpose of slices would be a slow sum of padded images.
 _blur.defvjp(lambda images: (_blur(images), None), lambda _, cotangent: (_blur(cotangent),))

@@ -9,8 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from l2dgs_jax.config import ModelConfig
-from l2dgs_jax.kernels.hexplane_lookup import Layout, lookup
-from l2dgs_jax.kernels.hexplane_lookup.layout import lerp
+from l2dgs_jax.kernels.hexplane_lookup import Layout, lerp, lookup
 from l2dgs_jax.types import HexPlane
 
 

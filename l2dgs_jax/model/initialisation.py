@@ -79,7 +79,7 @@ def initialise(
     return _initialise(
         key,
         *(None if x is None else jnp.asarray(x, float) for x in arrays),
-        cfg=_shaping(cfg),
+        cfg=_static_settings(cfg),
         num_frames=len(cameras.time),
         capacity=capacity,
     )
@@ -93,11 +93,11 @@ def scene_shapes(cfg: ModelConfig, num_frames: int) -> Scene:
         num_frames: training frames.
     """
     rows = [jax.ShapeDtypeStruct(shape, jnp.zeros(()).dtype) for shape in ((1, 3), (1,), (1,), (1,), (1, 3), (2,), ())]
-    build = partial(_initialise, cfg=_shaping(cfg), num_frames=num_frames, capacity=1)
+    build = partial(_initialise, cfg=_static_settings(cfg), num_frames=num_frames, capacity=1)
     return jax.eval_shape(build, jax.eval_shape(lambda: jax.random.key(0)), *rows)
 
 
-def _shaping(cfg: ModelConfig) -> ModelConfig:
+def _static_settings(cfg: ModelConfig) -> ModelConfig:
     """The settings without those that are only numbers to start from: scenes that differ in them share a program."""
     default = ModelConfig()
     return dataclasses.replace(

@@ -14,6 +14,7 @@ from l2dgs_jax.model import channels
 from l2dgs_jax.model.decomposition import decompose
 from l2dgs_jax.model.deformation import deform
 from l2dgs_jax.rasterizer import rasterize
+from l2dgs_jax.rasterizer.rasterization import LEAST_ALPHA
 from l2dgs_jax.runtime.capacity import next_capacity
 from l2dgs_jax.types import Camera, RenderOutput, Scene
 
@@ -129,5 +130,4 @@ def _render_welllit(*arguments: Any, **options: Any) -> _WellLit:
 
 def expected_depth(output: RenderOutput) -> Float[np.ndarray, "H W"]:
     """Mean depth along each ray, world units: depth / alpha, and 0 where nothing is drawn."""
-    alpha = np.asarray(output.alpha)
-    return np.where(alpha > 0, np.asarray(output.depth) / np.where(alpha > 0, alpha, 1), 0)
+    return np.asarray(output.depth) / np.maximum(np.asarray(output.alpha), LEAST_ALPHA)

@@ -7,8 +7,6 @@ import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
 BLUR = 1.0  # standard deviation in pixels of what takes noise off before matching
-
-
 LOST = 3.0  # pixels from where flow returns to that void a match
 
 
@@ -16,11 +14,11 @@ class Matches(NamedTuple):
     """A frame's matches with K others.
 
     Attributes:
-        places: where each pixel is found.
+        positions: where each pixel is found.
         errors: pixels between where a match starts and where flow from its end returns to.
     """
 
-    places: Float32[np.ndarray, "K H W 2"]
+    positions: Float32[np.ndarray, "K H W 2"]
     errors: Float32[np.ndarray, "K H W"]
 
 

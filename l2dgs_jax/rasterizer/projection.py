@@ -1,7 +1,8 @@
 """Projection of 3D Gaussians onto the image plane: elliptical weighted averaging (EWA)."""
 
-from functools import partial
-from typing import NamedTuple
+from collections.abc import Callable
+from functools import cache, partial
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
@@ -66,17 +67,21 @@ def project(
         eps2d: pixels^2, more than 0, added to the projected covariance, so that no Gaussian falls between pixels.
     """
     size = jnp.array([width, height], means.dtype)
-    before_camera = fusion_boundary(partial(_before_camera, near_plane=near_plane))
-    visible, depth, normalised = before_camera(tuple(means.T), viewmat)
+    visible, depth, normalised = _bounded(_before_camera, near_plane=near_plane)(tuple(means.T), viewmat)
     centre, jacobian = _through_lens(depth, normalised, viewmat, K, size)
     halves = _half(jacobian, _rotation(*_unit(*quats.T)), tuple(scales.T))
-    covariance = fusion_boundary(partial(_covariance, eps2d=eps2d))(*halves)
-    conic = fusion_boundary(partial(_conic, eps2d=eps2d))(*covariance)
+    covariance = _bounded(_covariance, eps2d=eps2d)(*halves)
+    conic = _bounded(_conic, eps2d=eps2d)(*covariance)
     return Projected(jnp.stack(centre).T, jnp.stack(covariance).T, jnp.stack(conic).T, depth, visible)
 
 
 # Every entry of a point or a matrix is a column, one vector over all Gaussians: arithmetic with whole columns is what
 # CPUs are fast at. Columns are kept between the functions; within one they are computed again for each that needs them.
+
+
+@cache  # one function for each number: what was compiled is found again
+def _bounded(function: Callable[..., Any], **numbers: float) -> Callable[..., Any]:
+    return fusion_boundary(partial(function, **numbers))
 
 
 @fusion_boundary

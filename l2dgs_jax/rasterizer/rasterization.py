@@ -14,6 +14,8 @@ from l2dgs_jax.rasterizer.projection import Projected, project
 from l2dgs_jax.rasterizer.tile_lists import Footprints, footprints, intersect, pairs_needed
 from l2dgs_jax.types import RasterOutput
 
+LEAST_ALPHA = 1e-10  # that an expected depth is divided by: nothing drawn is as faint
+
 
 def rasterize(
     means: Float[Array, "*B N 3"],
@@ -51,8 +53,9 @@ def rasterize(
         K: intrinsics, pixels.
         width: pixels.
         height: pixels.
-        near_plane: world units; Gaussians whose centre is nearer to the camera's plane are not drawn.
-        eps2d: pixels^2, more than 0, added to the projected covariance: no Gaussian falls between pixels.
+        near_plane: world units, more than 0; Gaussians whose centre is nearer to the camera's plane are not drawn.
+            Every value is a compilation.
+        eps2d: pixels^2, more than 0, added to the projected covariance: no Gaussian falls between pixels. Likewise.
         depth_mode: depth along the camera's z axis, world units, as "accumulated", the sum of w z over the Gaussians of
             a pixel, or "expected", that sum over their accumulated opacity.
         means2d_probe: added to the projected centres, pixels; zeros, whose gradient is dL/d(mean2d).
@@ -60,9 +63,11 @@ def rasterize(
             arrays: outside jit and vmap only.
 
     Raises:
-        ValueError: `pair_capacity` is None under a transformation that hides the arrays' values; or there are Gaussians
-            for other views than there are cameras.
+        ValueError: `pair_capacity` is None under a transformation that hides the arrays' values; there are Gaussians
+            for other views than there are cameras; or there is no such `depth_mode`.
     """
+    if depth_mode not in ("accumulated", "expected"):
+        raise ValueError(f"depth_mode is {depth_mode!r}; expected 'accumulated' or 'expected'")
     views = viewmat.shape[:-2]
     gaussians: tuple[Array, ...] = (means, quats, scales, opacities, features)
     if means.ndim == 2 and views:
@@ -84,7 +89,7 @@ def rasterize(
         pair_capacity = max(-(-needed // step), 1) * step
     output = _rasterize(*arrays, **static, capacity=pair_capacity)
     if depth_mode == "expected":
-        output = output._replace(depth=output.depth / jnp.maximum(output.alpha, 1e-10))
+        output = output._replace(depth=output.depth / jnp.maximum(output.alpha, LEAST_ALPHA))
     return output if views else jax.tree.map(lambda x: x[0] if x.ndim else x, output)
 
 

@@ -11,6 +11,7 @@ from l2dgs_jax.runs.folder import (
     VIDEO,
     open_run,
     read_settings,
+    save_run,
     write_settings,
 )
 from l2dgs_jax.runs.recorder import Recorder
@@ -29,5 +30,6 @@ __all__ = [
     "fit",
     "open_run",
     "read_settings",
+    "save_run",
     "write_settings",
 ]

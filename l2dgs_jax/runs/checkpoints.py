@@ -19,10 +19,10 @@ from l2dgs_jax.training.step import TrainState
 
 
 class Checkpoint(NamedTuple):
-    """A training state and the size of the pair buffer that it ran with."""
+    """A training state and the size of the pair buffer that it ran with, if it has run."""
 
     state: TrainState
-    pair_capacity: int
+    pair_capacity: int | None = None
 
 
 def save(path: Path, checkpoint: Checkpoint, config: Config) -> None:

@@ -1,5 +1,6 @@
 """From a data set to a trained scene, in memory."""
 
+import dataclasses
 from collections.abc import Callable
 
 from l2dgs_jax.config import Config
@@ -18,30 +19,37 @@ def fit(
     start: Checkpoint | None = None,
     device_count: int | None = None,
 ) -> Run:
-    """Train a scene, coarse stage then fine. Nothing is written to disk.
+    """Train a scene, coarse stage then fine. Nothing is written to disk; `save_run` does that.
+
+    If jax has not started yet, every core of the processor becomes a device, as in the command lines.
 
     Args:
-        dataset: what was filmed, as `load_dataset` returns it.
-        config: settings, such as one of `PRESETS`. Those of how a scene is read (`downscale`, `format`, `held_out`,
-            `frame_memory`) have had their say in `load_dataset` and are ignored.
-        on_step: called after every step; its argument is valid until it returns. A `runs.Recorder` leaves metrics and
-            checkpoints in a folder.
+        dataset: what was filmed, as `load_dataset` returns it. Settings of how a scene is read are taken from it.
+        config: all other settings, such as one of `PRESETS`.
+        on_step: called after every step; its argument is valid until it returns.
         start: a state to go on from; a fresh one if not given.
         device_count: how many devices the views of a step are spread over; as many as share them evenly if not given.
 
     Raises:
         DivergedError: the loss or a gradient is not finite.
         UserError: the numbers of steps make no training.
-        ValueError: there are not that many devices.
+        ValueError: the views cannot be spread over so many devices, there are not that many, or one of several
+            processes would be left without.
     """
     config.check_steps()
     devices.one_per_core()
+    if device_count is None:
+        device_count = devices.shares(config.batch_size)
+    if device_count < 1 or config.batch_size % device_count:
+        raise ValueError(f"device_count is {device_count}; expected a divisor of the batch size, {config.batch_size}")
+    mesh = devices.mesh(views=device_count)
+    if dataset.source:
+        config = dataclasses.replace(config, **dataset.source.settings)
     config = resolve(config, dataset.train)
-    mesh = devices.mesh(views=device_count or devices.shares(config.batch_size))
-    state, pair_capacity = start or (initial_state(dataset, config), None)
+    state, pair_capacity = start or Checkpoint(initial_state(dataset, config))
     member = Member(dataset.train, config, state)
     for progress in engine.run([member], pair_capacity, mesh):
         if on_step:
             on_step(progress)
         state = progress.states
-    return Run(config, dataset, devices.member(state, 0) if state is not member.state else state)
+    return Run(config, dataset, state if state is member.state else devices.member(state, 0))

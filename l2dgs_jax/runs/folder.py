@@ -1,14 +1,17 @@
 """The folder of a training run: what lies where, and how the other commands open it."""
 
+import dataclasses
 import json
 from pathlib import Path
+from typing import Literal
 
 from l2dgs_jax.config import Config, from_dict, to_dict
 from l2dgs_jax.data import load_dataset
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.runs import checkpoints
+from l2dgs_jax.runs.checkpoints import Checkpoint
 from l2dgs_jax.runs.run import Run
-from l2dgs_jax.runtime.files import make_folder, write_json
+from l2dgs_jax.runtime.files import is_taken, make_folder, write_json
 
 SETTINGS = "config.json"
 CHECKPOINT = "checkpoint.npz"
@@ -44,8 +47,36 @@ def read_settings(folder: Path) -> tuple[str, Config]:
         raise UserError(f"{path}: unreadable settings ({error}); expected those that train wrote") from None
 
 
-def open_run(folder: str | Path, stage: str = "final") -> Run:
-    """Open a run's last checkpoint (`stage` "final") or the one at the end of its coarse stage ("coarse").
+def save_run(run: Run, folder: str | Path) -> Run:
+    """Write a run's settings and state to a new folder, which the commands and `open_run` take it from.
+
+    Args:
+        run: as `fit` returns it.
+        folder: to make.
+
+    Returns:
+        The run as it lies there.
+
+    Raises:
+        UserError: the folder holds something already or cannot be written, or the run's data set was not read from a
+            scene.
+    """
+    folder = Path(folder)
+    if run.dataset.source is None:
+        raise UserError(f"{run.name}: was not read from a scene; expected a data set that load_dataset returned")
+    if is_taken(folder):
+        raise UserError(f"{folder}: already holds another run or files; expected a new folder")
+    write_settings(folder, run.dataset.source.scene, run.config)
+    checkpoints.save(folder / CHECKPOINT, Checkpoint(run.state), run.config)
+    return dataclasses.replace(run, folder=folder)
+
+
+def open_run(folder: str | Path, stage: Literal["final", "coarse"] = "final") -> Run:
+    """Open a run's folder.
+
+    Args:
+        folder: that `train`, `sweep` or `save_run` wrote.
+        stage: "final" for the last checkpoint, "coarse" for the one at the end of the coarse stage.
 
     Raises:
         UserError: settings, scene or checkpoint are missing or do not fit together.

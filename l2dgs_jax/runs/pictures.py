@@ -7,16 +7,18 @@ import numpy as np
 from l2dgs_jax.data.dataset import Split
 from l2dgs_jax.data.images import to_bytes, write_image
 from l2dgs_jax.model.rendering import expected_depth
-from l2dgs_jax.runs.folder import Run
+from l2dgs_jax.runs.run import Run
 from l2dgs_jax.runs.views import views
 from l2dgs_jax.runtime.files import make_folder, write_json
-
 
 KINDS = ("welllit", "lowlight", "illumination", "reflectance", "depth")
 
 
 def write_views(run: Run, split: Split, folder: Path) -> None:
-    """Render every view of `split` into `folder`, laid out as `Render` says.
+    """Render every view of `split` into `folder`: {welllit,lowlight,illumination,reflectance,depth}/NAME.png.
+
+    Depth has 16 bits: a value v stands for v * unit, in the units of the scene's cameras, with the unit in
+    `depth.json`; 0 means that nothing is there.
 
     Raises:
         UserError: a file cannot be written.

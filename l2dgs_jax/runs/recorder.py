@@ -3,7 +3,6 @@
 import json
 import time
 from pathlib import Path
-from typing import Any
 
 from l2dgs_jax.config import Config
 from l2dgs_jax.runs import checkpoints
@@ -19,14 +18,28 @@ class Recorder:
     """Records one member of a training in its run folder."""
 
     def __init__(self, folder: Path, config: Config, done: int):
-        """Metrics after the step `done`, from a run that was interrupted after its last checkpoint, are dropped."""
+        """Drop metrics after the step `done`, from a run that was interrupted after its last checkpoint.
+
+        Args:
+            folder: of the run, which exists.
+            config: its settings, what they left to the data filled in.
+            done: number of steps already taken.
+        """
         self.folder, self.config, self.begun = folder, config, time.monotonic()
         metrics = folder / METRICS
         kept = [line for line in metrics.read_text().splitlines() if json.loads(line)["step"] <= done] if done else []
         metrics.write_text("".join(f"{line}\n" for line in kept))
 
     def __call__(self, progress: Progress, member: int = 0) -> dict | None:
-        """Write what is due after a step; the line of metrics, if one was."""
+        """Write what is due after a step.
+
+        Args:
+            progress: as `engine.run` yields it.
+            member: which of its members.
+
+        Returns:
+            The line of metrics, if one was due.
+        """
         step, config = progress.step, self.config
         last = step == config.steps
         if step == config.coarse_steps:

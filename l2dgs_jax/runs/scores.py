@@ -12,7 +12,7 @@ from l2dgs_jax.data.dataset import Split
 from l2dgs_jax.data.stacks import MappedArray, pixel_mean, stacked
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.metrics import RegionScore
-from l2dgs_jax.runs.folder import Run
+from l2dgs_jax.runs.run import Run
 from l2dgs_jax.runs.views import get_split, views
 
 

@@ -5,10 +5,9 @@ from collections.abc import Iterator
 import jax
 from tqdm import tqdm
 
-from l2dgs_jax.cameras.geometry import select_camera
 from l2dgs_jax.data.dataset import Split
 from l2dgs_jax.errors import UserError
-from l2dgs_jax.runs.folder import Run
+from l2dgs_jax.runs.run import Run
 from l2dgs_jax.runtime.prefetch import prefetch
 from l2dgs_jax.types import RenderOutput
 
@@ -16,7 +15,7 @@ from l2dgs_jax.types import RenderOutput
 def views(run: Run, split: Split) -> Iterator[RenderOutput]:
     """Render the views of `split` in order, as NumPy arrays, showing progress."""
     renderer = run.renderer()
-    outputs = prefetch(lambda i: jax.device_get(renderer(select_camera(split.cameras, i))), range(len(split.names)))
+    outputs = prefetch(lambda i: jax.device_get(renderer(split.camera(i))), range(len(split.names)))
     yield from tqdm(outputs, total=len(split.names), desc="render", unit="view", dynamic_ncols=True)
 
 

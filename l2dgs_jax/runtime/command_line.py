@@ -28,7 +28,7 @@ def run(
     """
     if huge_pages and not {"-h", "--help"} & set(sys.argv):
         use_huge_pages()
-    devices.use_native_additions()
+    devices.use_atomic_additions()
     use_compilation_cache()
     try:
         with warnings.catch_warnings():
@@ -46,7 +46,8 @@ def _show_warning(message: Warning | str, *_: Any) -> None:
 
 def parse(kind: type[T], arguments: Sequence[str], program: str, default: T | None = None) -> T:
     """Parse command-line arguments into the dataclass `kind`."""
-    program = f"python -m l2dgs_jax.{program}"
+    script = f"l2dgs {program}"
+    program = script if sys.argv[0] == script else f"python -m l2dgs_jax.{program}"
     if default is None:
         return tyro.cli(kind, args=arguments, prog=program)
     return tyro.cli(kind, args=arguments, prog=program, default=default)

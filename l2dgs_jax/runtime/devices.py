@@ -4,6 +4,7 @@ import contextlib
 import importlib.util
 import itertools
 import os
+import re
 from collections.abc import Iterator
 from typing import TypeVar
 
@@ -31,16 +32,17 @@ def one_per_core() -> None:
             jax.config.update("jax_num_cpu_devices", cores)
 
 
-def use_native_additions() -> None:
+def use_atomic_additions() -> None:
     """On NVIDIA GPUs, have floats added to memory by one instruction; in effect only before jax has started.
 
     jaxlib before 0.11.1 otherwise adds them by loops that compare and swap (jax issue 38806), because the instruction
     takes subnormal numbers for zero; the flag says that all of XLA may.
     """
-    installed = any(importlib.util.find_spec(f"jax_cuda{version}_plugin") for version in (12, 13))
-    older = tuple(int(part) for part in jaxlib.__version__.split(".")[:3]) < (0, 11, 1)
     flags = os.environ.get("XLA_FLAGS", "")
-    if installed and older and "xla_gpu_ftz" not in flags:
+    if not any(importlib.util.find_spec(f"jax_cuda{version}_plugin") for version in (12, 13)):
+        return
+    numbers = [int(part) for part in re.findall(r"\d+", jaxlib.__version__)[:3]]
+    if numbers < [0, 11, 1] and "xla_gpu_ftz" not in flags:
         os.environ["XLA_FLAGS"] = f"{flags} --xla_gpu_ftz=true".strip()
 
 

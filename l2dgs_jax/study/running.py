@@ -23,8 +23,6 @@ from l2dgs_jax.training import DivergedError, Member, Progress, engine, initial_
 from l2dgs_jax.visualize import contact_sheet
 
 PLANS = "study.json"  # the members that OUT holds
-
-
 DIVERGED = "diverged.json"  # in the folder of a member that is frozen
 
 
@@ -92,14 +90,14 @@ def _mesh(group: Sequence[Trial], device_count: int) -> Mesh | None:
 def _train(group: Sequence[Trial], output: Path, mesh: Mesh | None) -> None:
     """Train what is neither finished nor frozen, from where it stands."""
     members: dict[str, Member] = {}
-    pair_capacity = None
+    pair_capacity: int | None = None
     for trial in group:
         folder, config = output / trial.plan.name, trial.config
         if (folder / DIVERGED).exists():
             continue
         if (folder / runs.CHECKPOINT).exists():
             state, needed = checkpoints.load(folder / runs.CHECKPOINT, config, len(trial.dataset.train.names))
-            pair_capacity = max(needed, pair_capacity or 0)
+            pair_capacity = max(needed or 0, pair_capacity or 0) or None
         else:
             state = initial_state(trial.dataset, config)
         if int(state.step) < config.steps:

@@ -67,9 +67,11 @@ def read(path: Path) -> Spec:
     plans: list[Plan] = []
     for scene, seed, point, (label, variant) in itertools.product(scenes, seeds, grid, variants):
         varied = {"seed": seed, **point, **variant}
-        config = overrides.replace(PRESETS[preset], settings | varied)
-        if config.steps < 1 or min(config.coarse_steps, config.fine_steps) < 0:
-            raise UserError(f"{path}: coarse_steps and fine_steps must not be negative, and one step at least in all")
+        try:
+            config = overrides.replace(PRESETS[preset], settings | varied)
+            config.check_steps()
+        except UserError as error:
+            raise UserError(f"{path}: {error}") from None
         parts = [f"{len(plans):02d}", Path(scene).name, f"seed{seed}", *_labels(point), *([label] if label else [])]
         plans.append(Plan("-".join(parts), scene, config, varied))
     return Spec(tuple(plans), one_program)

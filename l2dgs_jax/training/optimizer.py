@@ -113,7 +113,7 @@ def take_step(
         state: likewise.
 
     Returns:
-        Parameters and state after the step, the auxiliary, and the gradient's norm.
+        Parameters and Adam's state after the step, the auxiliary, and the gradient's norm.
     """
     solver = OptaxSolver(value_and_gradient, transformation, value_and_grad=True, has_aux=True, jit=False)
     zero = jnp.zeros((), jnp.result_type(*jax.tree.leaves(params)))

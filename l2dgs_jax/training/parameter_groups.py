@@ -41,9 +41,6 @@ def schedules(cfg: OptimConfig, extent: Float[Array, ""], stage_steps: int) -> d
         cfg: rates and decay.
         extent: world units, multiplies the rates of `cfg.extent_scales`.
         stage_steps: length of a decay where `cfg.decay_steps` is None.
-
-    Raises:
-        ValueError: `cfg.extent_scales` names a group that does not exist.
     """
     rates = {
         "means": (cfg.means_lr, cfg.means_lr_end),
@@ -59,9 +56,6 @@ def schedules(cfg: OptimConfig, extent: Float[Array, ""], stage_steps: int) -> d
         "scales": (cfg.scales_lr, cfg.scales_lr),
         "quats": (cfg.quats_lr, cfg.quats_lr),
     }
-    unknown = sorted(set(cfg.extent_scales) - set(rates))
-    if unknown:
-        raise ValueError(f"optim.extent_scales names {unknown[0]!r}; expected some of {', '.join(rates)}")
     steps = jnp.maximum(stage_steps if cfg.decay_steps is None else cfg.decay_steps, 1)
     factor = lambda name: extent if name in cfg.extent_scales else jnp.ones_like(extent)
     return {

@@ -83,8 +83,18 @@ def objective(
     Gradients flow to `params` and to `probe`, zeros added to the projected centres. The loss is that of the views at
     hand: with views spread over the devices of `axis`, its mean over them is the loss of all views.
 
+    Args:
+        params: of the scene, in place of those that `state` holds.
+        probe: zeros, pixels.
+        state: the scene, and which step this is.
+        batch: V views.
+        config: settings.
+        moving: whether it is a step of the fine stage.
+        pair_capacity: size of the pair buffer for the views at hand.
+        axis: see `train_step`.
+
     Returns:
-        The loss, and (the report, the Gaussians' radii in every view).
+        The loss, and (the report, the Gaussians' radii in every view, pixels).
     """
     height, width = batch.images.shape[1:3]
     output = render(
@@ -187,7 +197,14 @@ def adam(params: SceneParams, rates: dict[str, optimizer.Schedule], config: Conf
 
 
 def begin_stage(scene: Scene, step: Int[Array, ""], config: Config, stage_steps: int) -> TrainState:
-    """A state with fresh optimizer moments, schedules and statistics, as 4DGS starts each stage."""
+    """A state with fresh optimizer moments, schedules and statistics, as 4DGS starts each stage.
+
+    Args:
+        scene: as it stands.
+        step: number of finished steps of the run.
+        config: settings.
+        stage_steps: length of the stage that begins.
+    """
     rates = schedules(config.optim, scene.extent, stage_steps)
     transformation = adam(scene.params, rates, config)
     return TrainState(scene, transformation.init(scene.params), densification.empty_stats(scene.alive.shape[0]), step)

@@ -4,10 +4,9 @@ import jax
 import numpy as np
 from jaxtyping import UInt8
 
-from l2dgs_jax.cameras.geometry import select_camera
 from l2dgs_jax.data.images import to_bytes
 from l2dgs_jax.model.rendering import expected_depth
-from l2dgs_jax.runs.folder import Run
+from l2dgs_jax.runs.run import Run
 from l2dgs_jax.visualize.sheet import sheet, viridis
 
 COLUMNS = ("input", "re-lit low light", "well-lit", "truth", "L", "R", "B1", "B2", "depth")
@@ -29,7 +28,7 @@ def contact_sheet(run: Run, rows: int = 4) -> UInt8[np.ndarray, "H W 3"]:
     in_time = np.argsort(split.cameras.time, kind="stable")
     chosen = in_time[np.unique(np.linspace(0, len(in_time) - 1, rows).round().astype(int))].tolist()
     renderer = run.renderer()
-    outputs = [jax.device_get(renderer(select_camera(split.cameras, i))) for i in chosen]
+    outputs = [jax.device_get(renderer(split.camera(i))) for i in chosen]
 
     exponents = np.stack([output.images.attenuation for output in outputs])
     depths = np.stack([expected_depth(output) for output in outputs])

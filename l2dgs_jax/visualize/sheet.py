@@ -12,8 +12,6 @@ CELL_WIDTHS = (160, 400)  # pixels that a picture in the contact sheet is at lea
 
 
 STRIP = 22  # height of a line of text, pixels
-
-
 GAP = 4  # pixels between pictures
 
 

@@ -13,13 +13,11 @@ from l2dgs_jax.cameras.geometry import select_camera
 from l2dgs_jax.cameras.paths import space_time_path
 from l2dgs_jax.data.images import to_bytes
 from l2dgs_jax.errors import UserError
-from l2dgs_jax.runs.folder import Run
+from l2dgs_jax.runs.run import Run
 from l2dgs_jax.runtime.files import replacing
 from l2dgs_jax.runtime.prefetch import prefetch
 
 VIDEO_SECONDS = 4
-
-
 VIDEO_RATE = 24  # frames a second
 
 

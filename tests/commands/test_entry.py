@@ -2,10 +2,12 @@
 
 import subprocess
 import sys
+import warnings
 
 import pytest
 
 from l2dgs_jax.__main__ import COMMANDS
+from l2dgs_jax.runtime import command_line
 
 
 def run(*arguments):
@@ -41,3 +43,17 @@ def test_a_mistake_is_one_sentence_either_way(way, tmp_path):
     assert done.returncode == 2
     assert done.stderr.startswith("error: ")
     assert done.stderr.count("\n") == 1
+
+
+def test_help_names_the_program_that_was_called():
+    assert "usage: l2dgs convert" in run("-m", "l2dgs_jax", "convert", "--help").stdout
+    assert "usage: python -m l2dgs_jax.convert" in run("-m", "l2dgs_jax.convert", "--help").stdout
+
+
+def test_a_warning_is_one_sentence(capsys):
+    def command(arguments):
+        warnings.simplefilter("default")
+        warnings.warn("it is slow", RuntimeWarning, stacklevel=1)
+
+    command_line.run(command, [])
+    assert capsys.readouterr().err == "warning: it is slow\n"

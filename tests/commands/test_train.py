@@ -18,7 +18,7 @@ from l2dgs_jax.config import PRESETS
 from l2dgs_jax.data import load_dataset
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.runs import checkpoints
-from l2dgs_jax.runtime import command_line
+from l2dgs_jax.runtime import command_line, devices
 from l2dgs_jax.training import engine
 
 TINY = [
@@ -192,6 +192,20 @@ def test_resume_from_a_truncated_checkpoint(refuses, scene, finished, tmp_path):
     (tmp_path / runs.SETTINGS).write_bytes((finished[0] / runs.SETTINGS).read_bytes())
     (tmp_path / runs.CHECKPOINT).write_bytes((finished[0] / runs.CHECKPOINT).read_bytes()[:1000])
     refuses(scene, "--output", tmp_path, "--resume", naming=["checkpoint.npz", "truncated"])
+
+
+def test_what_cannot_start_leaves_no_folder(refuses, scene, tmp_path, monkeypatch):
+    def nowhere(views):
+        raise ValueError("2 devices leave some of the 3 processes without any")
+
+    monkeypatch.setattr(devices, "mesh", nowhere)
+    refuses(scene, "--output", tmp_path / "run", naming=["--devices", "without any"])
+    monkeypatch.undo()
+    unknown = "--optim.extent-scales"
+    refuses(scene, unknown, "means", "plane", "--output", tmp_path / "run", naming=[unknown, "planes"])
+    with pytest.raises(ValueError, match="at least 2 cells"):
+        train.main([str(scene), "--model.plane-size=1", "--output", str(tmp_path / "run")])
+    assert not (tmp_path / "run").exists()
 
 
 def test_an_unknown_option_is_refused(capsys, scene):

@@ -93,7 +93,7 @@ def test_flow_that_leaves_the_picture_or_does_not_return_is_no_match():
     there[..., 0], back[..., 0] = 2, -2
     back[3, 5] = (0, 0)
     matches = match(there, back)
-    np.testing.assert_allclose(matches.places[2, 1], [3.5, 2.5])
+    np.testing.assert_allclose(matches.positions[2, 1], [3.5, 2.5])
     assert matches.errors[3, 3] == 2
     assert (matches.errors[:, 6:] > LOST).all()
     assert matches.errors[:, :6].sum() == 2

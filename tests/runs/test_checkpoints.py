@@ -66,7 +66,9 @@ def test_no_array_is_read_before_all_are_known_to_fit(dataset, tmp_path, monkeyp
     np.savez(path, **{name: x for name, x in arrays.items() if name != last}, **changed)
 
     read, read_array = [], checkpoints.npy.read_array
-    monkeypatch.setattr(checkpoints.npy, "read_array", lambda file, **k: read.append(file.name) or read_array(file, **k))
+    monkeypatch.setattr(
+        checkpoints.npy, "read_array", lambda file, **k: read.append(file.name) or read_array(file, **k)
+    )
     with pytest.raises(UserError, match=rf"the array {last} is missing or has another shape; expected"):
         checkpoints.load(path, config, FRAMES)
     assert read == ["header.npy"]

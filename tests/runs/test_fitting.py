@@ -3,11 +3,13 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from tiny_training import make_dataset, tiny
+from scenes import write_nerfies
+from tiny_training import assert_equal_states, make_dataset, tiny
 
 from l2dgs_jax.config import PRESETS, overrides
+from l2dgs_jax.data import load_dataset
 from l2dgs_jax.errors import UserError
-from l2dgs_jax.runs import Checkpoint, fit
+from l2dgs_jax.runs import Checkpoint, fit, open_run, save_run
 from l2dgs_jax.runtime import devices
 from l2dgs_jax.training import engine, initial_state
 from l2dgs_jax.training.step import StepReport
@@ -51,10 +53,8 @@ def test_a_training_goes_on_from_a_state(dataset, quick):
 
 
 def test_what_is_left_to_the_data_is_filled_in(dataset, quick):
-    config = overrides.replace(
-        tiny(coarse_steps=1, fine_steps=0), {"model.initial_exponents": ("auto", 9.0), "model.initial_illumination": "auto"}
-    )
-    run = fit(dataset, config)
+    left = {"model.initial_exponents": ("auto", 9.0), "model.initial_illumination": "auto"}
+    run = fit(dataset, overrides.replace(tiny(coarse_steps=1, fine_steps=0), left))
     exponent, _ = run.config.model.initial_exponents
     assert 1 < exponent <= 2
     assert 0 < run.config.model.initial_illumination < 1
@@ -64,6 +64,9 @@ def test_what_is_left_to_the_data_is_filled_in(dataset, quick):
 def test_views_that_cannot_be_shared(dataset):
     with pytest.raises(ValueError, match="devices are wanted"):
         fit(dataset, tiny(batch_size=64), device_count=64)
+    for count in (0, 3):
+        with pytest.raises(ValueError, match=f"device_count is {count}; expected a divisor of the batch size, 2"):
+            fit(dataset, tiny(), device_count=count)
     with pytest.raises(UserError, match="at least one step"):
         fit(dataset, tiny(coarse_steps=0, fine_steps=0))
 
@@ -77,3 +80,25 @@ def test_views_of_any_size_and_instant(dataset, quick):
     assert wide.alpha.shape == (dataset.height, dataset.width + 8)
     assert np.abs(wide.alpha[:, : dataset.width] - view.alpha).mean() < 0.02
     assert run.renderer() is run.renderer(dataset.width, dataset.height)
+
+
+def test_a_saved_run_opens_and_goes_on(tmp_path, quick):
+    scene = write_nerfies(tmp_path / "scene", 8, 24, 18, num_points=12)
+    dataset = load_dataset(scene, downscale=2, held_out="3")
+    config = tiny(coarse_steps=2, fine_steps=2, density=PRESETS["default"].density)
+    run = fit(dataset, config)
+    assert (run.config.downscale, run.config.held_out) == (2, "3")
+    saved = save_run(run, tmp_path / "run")
+    assert saved.folder == tmp_path / "run"
+    again = open_run(tmp_path / "run")
+    assert again.config == run.config
+    assert_equal_states(again.state, run.state)
+    assert again.dataset.test.names == dataset.test.names
+    with pytest.raises(UserError, match="already holds"):
+        save_run(run, tmp_path / "run")
+
+
+def test_a_run_of_no_scene_cannot_be_saved(dataset, tmp_path, quick):
+    run = fit(dataset, tiny(coarse_steps=1, fine_steps=0, density=PRESETS["default"].density))
+    with pytest.raises(UserError, match="tiny: was not read from a scene"):
+        save_run(run, tmp_path / "run")

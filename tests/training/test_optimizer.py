@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 from l2dgs_jax.config import OptimConfig
+from l2dgs_jax.config.settings import RATE_GROUPS
+from l2dgs_jax.errors import UserError
 from l2dgs_jax.training import optimizer
 from l2dgs_jax.training.parameter_groups import schedules
 
@@ -104,8 +106,9 @@ def test_extent_scales_the_groups_it_should():
 
 
 def test_a_group_that_does_not_exist_cannot_be_scaled():
-    with pytest.raises(ValueError, match="extent_scales names 'plane'; expected some of means"):
-        schedules(OptimConfig(extent_scales=("means", "plane")), jnp.array(1.0), 70)
+    with pytest.raises(UserError, match=r"--optim\.extent-scales plane: expected some of means"):
+        OptimConfig(extent_scales=("means", "plane"))
+    assert set(RATE_GROUPS) == schedules(OptimConfig(), jnp.array(1.0), 70).keys()
 
 
 def test_a_group_without_a_rate_is_an_error():

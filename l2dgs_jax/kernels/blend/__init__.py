@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from l2dgs_jax.kernels.blend import accelerator, cpu, reference
 from l2dgs_jax.kernels.blend.alpha import GEOMETRY, PIXELS
-from l2dgs_jax.kernels.selection import by_form
+from l2dgs_jax.kernels.selection import by_form, functions_by_form
 from l2dgs_jax.kernels.tiles import TileLists
 
 Residuals = tuple[Float[Array, "G D"], TileLists, Float[Array, "T C P"]]
@@ -68,13 +68,9 @@ def _folded(
 
     A loop that is vmapped as it stands runs until its slowest member ends, and selects what to keep in every step.
     """
-    functions = {
-        form: partial(getattr(module, name), width=width, height=height)
-        for form, module in (("reference", reference), ("cpu", cpu), ("accelerator", accelerator))
-    }
-    folded = jax.custom_batching.custom_vmap(
-        lambda *arguments: by_form(*arguments, **functions, like=shape(*arguments))
-    )
+    size = {"width": width, "height": height}
+    forms = functions_by_form(name, reference=reference, cpu=cpu, accelerator=accelerator, **size)
+    folded = jax.custom_batching.custom_vmap(lambda *arguments: by_form(*arguments, **forms, like=shape(*arguments)))
 
     @folded.def_vmap
     def rule(members: int, batched: Any, *arguments: Any) -> tuple[Float[Array, "..."], bool]:

@@ -11,17 +11,17 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from l2dgs_jax.kernels.blend.blocks import in_blocks
-from l2dgs_jax.kernels.blend.walk import Stride, Sums, add_moments, blend_block, from_moments
+from l2dgs_jax.kernels.blend.walk import Chunking, Sums, add_moments, blend_block, from_moments
 from l2dgs_jax.kernels.tiles import TileLists
 
 BLOCK = 2048  # tiles
-STRIDE = Stride(chunk=8, unroll=True)
+CHUNKING = Chunking(size=8, unroll=True)
 
 
 def blend(packed: Float[Array, "G D"], lists: TileLists, *, width: int, height: int) -> Float[Array, "T C P"]:
     """See the contract."""
     blocks, _, position = in_blocks(lists, BLOCK, width, height, packed.dtype)
-    tiles = jax.lax.map(lambda block: blend_block(packed, lists.gaussians, block, STRIDE), blocks)
+    tiles = jax.lax.map(lambda block: blend_block(packed, lists.gaussians, block, CHUNKING), blocks)
     return tiles.reshape(-1, *tiles.shape[2:])[position]
 
 
@@ -36,7 +36,7 @@ def gradient(
 ) -> Float[Array, "G D"]:
     """The gradient of `blend` in `packed`."""
     blocks, tiles, _ = in_blocks(lists, BLOCK, width, height, packed.dtype)
-    add = partial(add_moments, stride=STRIDE, add_rows=_add_rows)
+    add = partial(add_moments, chunking=CHUNKING, add_rows=_add_rows)
     sums, _ = jax.lax.scan(
         lambda sums, block: (add(sums, packed, lists.gaussians, *block), None),
         jnp.zeros_like(packed),
@@ -46,5 +46,5 @@ def gradient(
 
 
 def _add_rows(sums: Sums, ids: Int[Array, "K B"], listed: Bool[Array, "K B"], rows: Float[Array, "K B D"]) -> Sums:
-    # Lists that have ended, and tiles that only fill up a block, must not queue for the memory of some Gaussian.
+    # Lists that have ended, and tiles that only fill up a block, must not contend for one row.
     return sums.at[jnp.where(listed, ids, len(sums))].add(rows, mode="drop")

@@ -10,12 +10,12 @@ from jaxtyping import Array, Bool, Float, Int
 from l2dgs_jax.kernels import loops
 from l2dgs_jax.kernels.blend import accelerator
 from l2dgs_jax.kernels.blend.blocks import Block, in_blocks
-from l2dgs_jax.kernels.blend.walk import Stride, Sums, add_moments, blend_block, from_moments
+from l2dgs_jax.kernels.blend.walk import Chunking, Sums, add_moments, blend_block, from_moments
 from l2dgs_jax.kernels.compilation import native_call
 from l2dgs_jax.kernels.tiles import TileLists
 
 BLOCK = 8  # tiles
-STRIDE = Stride(chunk=8, unroll=False)
+CHUNKING = Chunking(size=8, unroll=False)
 
 
 def blend(packed: Float[Array, "G D"], lists: TileLists, *, width: int, height: int) -> Float[Array, "T C P"]:
@@ -25,7 +25,7 @@ def blend(packed: Float[Array, "G D"], lists: TileLists, *, width: int, height: 
     blocks, _, position = in_blocks(lists, BLOCK, width, height, packed.dtype)
 
     def every_block(packed: Float[Array, "G D"], gaussians: Int[Array, " M"], blocks: Block) -> Float[Array, "S B C P"]:
-        return jax.lax.map(lambda block: blend_block(packed, gaussians, block, STRIDE), blocks)
+        return jax.lax.map(lambda block: blend_block(packed, gaussians, block, CHUNKING), blocks)
 
     tiles = native_call(every_block)(packed, lists.gaussians, blocks)
     return tiles.reshape(-1, *tiles.shape[2:])[position]
@@ -46,7 +46,7 @@ def gradient(
     blocks, tiles, _ = in_blocks(lists, BLOCK, width, height, packed.dtype)
 
     def every_block(packed: Float[Array, "G D"], gaussians: Int[Array, " M"], *blocks: Any) -> Sums:
-        add = partial(add_moments, stride=STRIDE, add_rows=_add_rows)
+        add = partial(add_moments, chunking=CHUNKING, add_rows=_add_rows)
         return jax.lax.scan(
             lambda sums, block: (add(sums, packed, gaussians, *block), None), jnp.zeros_like(packed), blocks
         )[0]

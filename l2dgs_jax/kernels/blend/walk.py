@@ -20,15 +20,15 @@ Sums = Float[Array, "G D"]
 AddRows = Callable[[Sums, Int[Array, "K B"], Bool[Array, "K B"], Float[Array, "K B D"]], Sums]
 
 
-class Stride(NamedTuple):
+class Chunking(NamedTuple):
     """How a walk goes: Gaussians of each list between two looks at whether the block has ended, unrolled or not."""
 
-    chunk: int
+    size: int
     unroll: bool
 
 
 def blend_block(
-    packed: Float[Array, "G D"], gaussians: Int[Array, " M"], block: Block, stride: Stride
+    packed: Float[Array, "G D"], gaussians: Int[Array, " M"], block: Block, chunking: Chunking
 ) -> Float[Array, "B C P"]:
     """The blended features of the tiles of a block."""
     channels = packed.shape[1] - GEOMETRY
@@ -42,7 +42,7 @@ def blend_block(
 
     size = block.starts.shape[0]
     state = jnp.ones((size, PIXELS), packed.dtype), jnp.zeros((size, channels, PIXELS), packed.dtype)
-    return _walk(packed, gaussians, block, stride, add, state)[0][1]
+    return _walk(packed, gaussians, block, chunking, add, state)[0][1]
 
 
 def add_moments(
@@ -52,7 +52,7 @@ def add_moments(
     block: Block,
     image: Float[Array, "B C P"],
     g: Float[Array, "B C P"],
-    stride: Stride,
+    chunking: Chunking,
     add_rows: AddRows,
 ) -> Sums:
     """Add to `sums` what a block contributes to the gradient in `packed`, but for what `from_moments` does.
@@ -64,7 +64,7 @@ def add_moments(
         block: the tiles.
         image: the blended features of the tiles.
         g: their cotangents.
-        stride: how to walk.
+        chunking: how to walk.
         add_rows: (sums, ids, whether each is of a list, rows) -> sums with the rows added.
     """
     channels = range(packed.shape[1] - GEOMETRY)
@@ -102,7 +102,7 @@ def add_moments(
         return add_rows(sums, ids, listed, jnp.concatenate([moments, over_columns(features)], axis=-1))
 
     behind = sum(image[:, channel] * g[:, channel] for channel in channels)
-    return _walk(packed, gaussians, block, stride, pull, (jnp.ones_like(behind), behind), consume, sums)[1]
+    return _walk(packed, gaussians, block, chunking, pull, (jnp.ones_like(behind), behind), consume, sums)[1]
 
 
 def from_moments(packed: Float[Array, "G D"], sums: Sums) -> Float[Array, "G D"]:
@@ -117,7 +117,7 @@ def _walk(
     packed: Float[Array, "G D"],
     gaussians: Int[Array, " M"],
     block: Block,
-    stride: Stride,
+    chunking: Chunking,
     visit: Callable[[Any, Float[Array, "B D"]], tuple[Any, Any]],
     state: Any,
     consume: Callable[..., Any] = lambda sums, *_: sums,
@@ -129,7 +129,7 @@ def _walk(
         packed: see `blend`.
         gaussians: all lists, one after the other.
         block: the tiles.
-        stride: how.
+        chunking: how.
         visit: (state, values [B D]) -> (state, updates), for one Gaussian per tile, means measured from the tile's
             middle. `state[0]` is the transmittance.
         state: what it starts from.
@@ -141,16 +141,16 @@ def _walk(
 
     def unfinished(carry: Any) -> Bool[Array, ""]:
         step, (transmittance, *_), _ = carry
-        return (step * stride.chunk < longest) & ~jnp.all(transmittance <= MIN_TRANSMITTANCE)
+        return (step * chunking.size < longest) & ~jnp.all(transmittance <= MIN_TRANSMITTANCE)
 
     def body(carry: Any) -> Any:
         step, state, sums = carry
-        index = block.starts[None] + step * stride.chunk + jnp.arange(stride.chunk, dtype=jnp.int32)[:, None]
+        index = block.starts[None] + step * chunking.size + jnp.arange(chunking.size, dtype=jnp.int32)[:, None]
         listed = index < block.stops[None]
         ids = gaussians[jnp.minimum(index, gaussians.shape[0] - 1)]
         values = packed[ids].at[..., :2].add(-block.centres[None])
         values = jnp.where(listed[..., None], values, 0)
-        state, updates = jax.lax.scan(visit, state, values, unroll=stride.unroll)
+        state, updates = jax.lax.scan(visit, state, values, unroll=chunking.unroll)
         return step + 1, state, consume(sums, ids, listed, values, updates)
 
     return jax.lax.while_loop(unfinished, body, (0, state, sums))[1:]

@@ -4,7 +4,7 @@ import jax
 from jaxtyping import Array, Float
 
 from l2dgs_jax.kernels.convolution import accelerator, cpu, reference
-from l2dgs_jax.kernels.selection import by_form
+from l2dgs_jax.kernels.selection import by_form, functions_by_form
 
 Image = Float[Array, "B H W I"]
 Kernel = Float[Array, "K K I O"]
@@ -25,7 +25,7 @@ def convolve(x: Image, kernel: Kernel) -> Float[Array, "B H W O"]:
 @jax.custom_vjp
 def _few(x: Image, kernel: Kernel) -> Float[Array, "B H W O"]:
     like = jax.ShapeDtypeStruct((*x.shape[:3], kernel.shape[3]), x.dtype)
-    forms = {"reference": reference.convolve, "cpu": cpu.convolve, "accelerator": accelerator.convolve}
+    forms = functions_by_form("convolve", reference=reference, cpu=cpu, accelerator=accelerator)
     return by_form(x, kernel, **forms, like=like)
 
 
@@ -34,7 +34,7 @@ def _forward(x: Image, kernel: Kernel) -> tuple[Float[Array, "B H W O"], tuple[I
 
 
 def _backward(inputs: tuple[Image, Kernel], cotangent: Float[Array, "B H W O"]) -> tuple[Image, Kernel]:
-    forms = {"reference": reference.gradient, "cpu": cpu.gradient, "accelerator": accelerator.gradient}
+    forms = functions_by_form("gradient", reference=reference, cpu=cpu, accelerator=accelerator)
     return by_form(*inputs, cotangent, **forms, like=inputs)
 
 

@@ -5,7 +5,9 @@ planes of space and in lines are left. Planes are stored channels last and read 
 row a corner. All scales are looked up at once, as the rows of one table.
 """
 
+from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,10 +15,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from l2dgs_jax.kernels.hexplane_lookup import accelerator, cpu, reference
-from l2dgs_jax.kernels.hexplane_lookup.layout import Cells, Layout, Weights
-from l2dgs_jax.kernels.selection import by_form
+from l2dgs_jax.kernels.hexplane_lookup.layout import Cells, Layout, Weights, lerp
+from l2dgs_jax.kernels.selection import by_form, functions_by_form
 
-__all__ = ["Layout", "lookup"]
+__all__ = ["Layout", "lerp", "lookup"]
 
 Tables = tuple[Float[Array, "R C"], Float[Array, "L C"], Cells, Weights]
 
@@ -34,19 +36,21 @@ def lookup(
         lines: lines Z, X, Y as rows: scale by scale, each for every view.
         cell: x, y and z of the cell that a row of the result lies in.
         weight: how far into it, in [0, 1].
-        layout: what is static.
+        layout: what is fixed at compilation.
     """
     count, channels = len(cell[0]), space.shape[1]
     shape = layout.views, count, channels
     if not count:
         return jnp.zeros(shape, space.dtype)
-    functions = {
-        "reference": partial(reference.lookup, layout),
-        # A loop of one step would be unrolled, and a native call wants loops.
-        "cpu": partial((cpu if count > 1 else accelerator).lookup, layout),
-        "accelerator": partial(accelerator.lookup, layout),
-    }
-    return by_form(space, lines, cell, weight, **functions, like=jax.ShapeDtypeStruct(shape, space.dtype))
+    return by_form(
+        space, lines, cell, weight, **_forms("lookup", layout, count), like=jax.ShapeDtypeStruct(shape, space.dtype)
+    )
+
+
+def _forms(name: str, layout: Layout, count: int) -> dict[str, Callable[..., Any]]:
+    # A loop of one step would be unrolled, and native calls want loops.
+    cpu_form = cpu if count > 1 else accelerator
+    return functions_by_form(name, reference=reference, cpu=cpu_form, accelerator=accelerator, layout=layout)
 
 
 def _forward(
@@ -59,12 +63,7 @@ def _backward(layout: Layout, inputs: Tables, cotangent: Float[Array, "V M C"]) 
     space, lines, cell, weight = inputs
     count = len(cell[0])
     if count:
-        functions = {
-            "reference": partial(reference.gradient, layout),
-            "cpu": partial((cpu if count > 1 else accelerator).gradient, layout),
-            "accelerator": partial(accelerator.gradient, layout),
-        }
-        gradient = by_form(*inputs, cotangent, **functions, like=(space, lines, weight))
+        gradient = by_form(*inputs, cotangent, **_forms("gradient", layout, count), like=(space, lines, weight))
     else:
         gradient = jax.tree.map(jnp.zeros_like, (space, lines, weight))
     return *gradient[:2], jax.tree.map(lambda x: np.zeros(x.shape, jax.dtypes.float0), cell), gradient[2]

@@ -1,15 +1,25 @@
 """All rows at once: one gather from each table."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from l2dgs_jax.kernels.fusion import repeat_channels
-from l2dgs_jax.kernels.hexplane_lookup.layout import Cells, Layout, Weights, interpolate, of_scale, rows_read
+from l2dgs_jax.kernels.hexplane_lookup.layout import (
+    Cells,
+    Layout,
+    Weights,
+    gradient_of,
+    interpolate,
+    rows_read,
+    tables_of_scale,
+)
 
 
 def lookup(
-    layout: Layout, space: Float[Array, "R C"], lines: Float[Array, "L C"], cell: Cells, weight: Weights
+    space: Float[Array, "R C"], lines: Float[Array, "L C"], cell: Cells, weight: Weights, *, layout: Layout
 ) -> Float[Array, "V M C"]:
     """See the contract."""
 
@@ -20,19 +30,19 @@ def lookup(
         return jax.tree.unflatten(structure, jnp.split(values, len(ids)))
 
     scale = jnp.arange(len(cell[0]), dtype=jnp.int32) % len(layout.sizes)
-    corners, ends = rows_read(layout.views, of_scale(layout, scale), cell)
+    corners, ends = rows_read(layout.views, tables_of_scale(layout, scale), cell)
     weights = [repeat_channels(w, space.shape[1]) for w in weight]
     return jnp.stack(interpolate(gather(space, corners), gather(lines, ends), weights, layout.aggregation))
 
 
 def gradient(
-    layout: Layout,
     space: Float[Array, "R C"],
     lines: Float[Array, "L C"],
     cell: Cells,
     weight: Weights,
     cotangent: Float[Array, "V M C"],
+    *,
+    layout: Layout,
 ) -> tuple[Float[Array, "R C"], Float[Array, "L C"], Weights]:
     """The gradients of `lookup` in `space`, `lines` and `weight`."""
-    _, pull = jax.vjp(lambda space, lines, weight: lookup(layout, space, lines, cell, weight), space, lines, weight)
-    return pull(cotangent)
+    return gradient_of(partial(lookup, layout=layout), space, lines, cell, weight, cotangent)

@@ -9,18 +9,26 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from l2dgs_jax.kernels.compilation import native_call
-from l2dgs_jax.kernels.hexplane_lookup.layout import Cells, Layout, OfScale, Weights, interpolate, of_scale, rows_read
+from l2dgs_jax.kernels.hexplane_lookup.layout import (
+    Cells,
+    Layout,
+    ScaleTables,
+    Weights,
+    interpolate,
+    rows_read,
+    tables_of_scale,
+)
 from l2dgs_jax.kernels.loops import Index, add_row, loop, read, read_row, write_row
 
 
 def lookup(
-    layout: Layout, space: Float[Array, "R C"], lines: Float[Array, "L C"], cell: Cells, weight: Weights
+    space: Float[Array, "R C"], lines: Float[Array, "L C"], cell: Cells, weight: Weights, *, layout: Layout
 ) -> Float[Array, "V M C"]:
     """See the contract; at least two rows."""
     count, channels = len(cell[0]), space.shape[1]
 
     def look_up(*inputs: Any) -> Float[Array, "VM C"]:
-        def look(scale: OfScale, row: Index, found: Float[Array, "VM C"]) -> Float[Array, "VM C"]:
+        def look(scale: ScaleTables, row: Index, found: Float[Array, "VM C"]) -> Float[Array, "VM C"]:
             _, (corners, ends, weights) = _inputs_of_row(layout.views, scale, inputs, row)
             for view, value in enumerate(interpolate(corners, ends, weights, layout.aggregation)):
                 found = write_row(found, view * count + row, value)
@@ -32,18 +40,19 @@ def lookup(
 
 
 def gradient(
-    layout: Layout,
     space: Float[Array, "R C"],
     lines: Float[Array, "L C"],
     cell: Cells,
     weight: Weights,
     cotangent: Float[Array, "V M C"],
+    *,
+    layout: Layout,
 ) -> tuple[Float[Array, "R C"], Float[Array, "L C"], Weights]:
     """The gradients of `lookup` in `space`, `lines` and `weight`."""
     count, channels = len(cell[0]), space.shape[1]
 
     def pull_back(cotangent: Float[Array, "VM C"], *inputs: Any) -> tuple[Float[Array, "..."], ...]:
-        def pull(scale: OfScale, row: Index, sums: Any) -> Any:
+        def pull(scale: ScaleTables, row: Index, sums: Any) -> Any:
             rows, values = _inputs_of_row(layout.views, scale, inputs, row)
             _, transpose = jax.vjp(partial(interpolate, aggregation=layout.aggregation), *values)
             *in_tables, in_weights = transpose([read_row(cotangent, v * count + row) for v in range(layout.views)])
@@ -66,7 +75,7 @@ def gradient(
     return in_space, in_lines, tuple(in_weights)
 
 
-def _inputs_of_row(views: int, scale: OfScale, inputs: Any, row: Index) -> tuple[Any, Any]:
+def _inputs_of_row(views: int, scale: ScaleTables, inputs: Any, row: Index) -> tuple[Any, Any]:
     """The rows of the tables that a row of the result reads, and the arguments of `interpolate` for it alone."""
     space, lines, cell, weight = inputs
     rows = rows_read(views, scale, tuple(read(x, row) for x in cell))  # type: ignore[arg-type]
@@ -77,12 +86,12 @@ def _inputs_of_row(views: int, scale: OfScale, inputs: Any, row: Index) -> tuple
     return rows, (corners, ends, weights)
 
 
-def _each_row(layout: Layout, count: int, body: Callable[[OfScale, Index, Any], Any], state: Any) -> Any:
+def _each_row(layout: Layout, count: int, body: Callable[[ScaleTables, Index, Any], Any], state: Any) -> Any:
     """A loop over the rows, scale by scale: the planes of one scale may fit a cache."""
     scales = len(layout.sizes)
 
     def each_point(scale: Index, state: Any) -> Any:
-        tables = of_scale(layout, scale)
+        tables = tables_of_scale(layout, scale)
         return loop(count // scales, lambda point, state: body(tables, point * scales + scale, state), state)
 
     return loop(scales, each_point, state)

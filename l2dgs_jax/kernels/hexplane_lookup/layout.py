@@ -1,7 +1,9 @@
 """Where the rows of the tables lie, and what is interpolated from them."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -13,13 +15,13 @@ TIME_AXES = (2, 0, 1)
 Cells = tuple[Int[Array, "*M"], Int[Array, "*M"], Int[Array, "*M"]]
 Weights = tuple[Float[Array, "*M"], Float[Array, "*M"], Float[Array, "*M"]]
 Rows = list[Float[Array, "M C"]]
-OfScale = tuple[Int[Array, "*M"], Int[Array, "*M"], Int[Array, "*M"]]
+ScaleTables = tuple[Int[Array, "*M"], Int[Array, "*M"], Int[Array, "*M"]]
 Corners = list[list[Int[Array, "*M"]]]  # of the planes
 Ends = list[list[list[Int[Array, "*M"]]]]  # of the lines, for each view
 
 
 class Layout(NamedTuple):
-    """What is static about a lookup.
+    """What is fixed at compilation.
 
     Attributes:
         sizes: cells of a spatial axis at each scale.
@@ -37,7 +39,7 @@ def lerp(start: Float[Array, "*S"], end: Float[Array, "*S"], weight: Float[Array
     return start + weight * (end - start)
 
 
-def of_scale(layout: Layout, scale: Int[Array, "*M"]) -> OfScale:
+def tables_of_scale(layout: Layout, scale: Int[Array, "*M"]) -> ScaleTables:
     """Cells of a spatial axis at a scale, and its first rows in the tables of space and of lines."""
 
     def at_scale(values: Int[np.ndarray, " S"]) -> Int[Array, "..."]:
@@ -50,9 +52,9 @@ def of_scale(layout: Layout, scale: Int[Array, "*M"]) -> OfScale:
     return at_scale(sizes), first_row(3 * sizes**2), first_row(3 * layout.views * sizes)
 
 
-def rows_read(views: int, of_scale: OfScale, cell: Cells) -> tuple[Corners, Ends]:
+def rows_read(views: int, tables: ScaleTables, cell: Cells) -> tuple[Corners, Ends]:
     """Rows of the tables that a row of the lookup reads: four corners of each plane, two ends of each time's lines."""
-    size, in_space, in_lines = of_scale
+    size, in_space, in_lines = tables
     corners = [
         [in_space + (plane * size + cell[a]) * size + cell[b] + offset for offset in (0, 1, size, size + 1)]
         for plane, (a, b) in enumerate(SPACE_AXES)
@@ -68,7 +70,14 @@ def rows_read(views: int, of_scale: OfScale, cell: Cells) -> tuple[Corners, Ends
 
 
 def interpolate(corners: list[Rows], ends: list[list[Rows]], weights: Rows, aggregation: str) -> Rows:
-    """For each view, the argument of g in Eq. 1, or the product of all six features."""
+    """For each view, the argument of g in Eq. 1, or the product of all six features; gradients flow to all arrays.
+
+    Args:
+        corners: of each plane of space, the values [M C] at the four corners of the cells.
+        ends: for each view and line, the values at the two ends of the cells.
+        weights: how far into the cell, along x, y and z.
+        aggregation: see `Layout`.
+    """
     space = [
         lerp(lerp(c00, c01, weights[b]), lerp(c10, c11, weights[b]), weights[a])
         for (a, b), (c00, c01, c10, c11) in zip(SPACE_AXES, corners, strict=True)
@@ -79,3 +88,16 @@ def interpolate(corners: list[Rows], ends: list[list[Rows]], weights: Rows, aggr
         xy, yz, zx = (plane * line for plane, line in zip(space, time, strict=True))
         values.append(xy + yz + zx if aggregation == "paired_sum" else xy * yz * zx)
     return values
+
+
+def gradient_of(
+    lookup: Callable[..., Float[Array, "V M C"]],
+    space: Float[Array, "R C"],
+    lines: Float[Array, "L C"],
+    cell: Cells,
+    weight: Weights,
+    cotangent: Float[Array, "V M C"],
+) -> tuple[Float[Array, "R C"], Float[Array, "L C"], Weights]:
+    """The gradients of a lookup in `space`, `lines` and `weight`, as JAX derives them."""
+    _, pull = jax.vjp(lambda space, lines, weight: lookup(space, lines, cell, weight), space, lines, weight)
+    return pull(cotangent)

@@ -1,14 +1,15 @@
 """Plane by plane and line by line; differentiated by JAX."""
 
-import jax
+from functools import partial
+
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from l2dgs_jax.kernels.hexplane_lookup.layout import SPACE_AXES, TIME_AXES, Cells, Layout, Weights
+from l2dgs_jax.kernels.hexplane_lookup.layout import SPACE_AXES, TIME_AXES, Cells, Layout, Weights, gradient_of
 
 
 def lookup(
-    layout: Layout, space: Float[Array, "R C"], lines: Float[Array, "L C"], cell: Cells, weight: Weights
+    space: Float[Array, "R C"], lines: Float[Array, "L C"], cell: Cells, weight: Weights, *, layout: Layout
 ) -> Float[Array, "V M C"]:
     """See the contract."""
     scales, channels = len(layout.sizes), space.shape[1]
@@ -24,16 +25,16 @@ def lookup(
 
 
 def gradient(
-    layout: Layout,
     space: Float[Array, "R C"],
     lines: Float[Array, "L C"],
     cell: Cells,
     weight: Weights,
     cotangent: Float[Array, "V M C"],
+    *,
+    layout: Layout,
 ) -> tuple[Float[Array, "R C"], Float[Array, "L C"], Weights]:
     """The gradients of `lookup` in `space`, `lines` and `weight`."""
-    _, pull = jax.vjp(lambda space, lines, weight: lookup(layout, space, lines, cell, weight), space, lines, weight)
-    return pull(cotangent)
+    return gradient_of(partial(lookup, layout=layout), space, lines, cell, weight, cotangent)
 
 
 def _features(

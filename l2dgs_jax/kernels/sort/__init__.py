@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from l2dgs_jax.kernels.selection import by_form
+from l2dgs_jax.kernels.selection import by_form, functions_by_form
 from l2dgs_jax.kernels.sort import accelerator, cpu, reference
 
 Pairs = tuple[Int[Array, " M"], Int[Array, " M"], Int[Array, " T1"]]
@@ -13,13 +13,12 @@ Pairs = tuple[Int[Array, " M"], Int[Array, " M"], Int[Array, " T1"]]
 def argsort(values: Float[Array, " N"]) -> Int[Array, " N"]:
     """The stable order of floats, NaN with its sign bit clear last; carries no gradients."""
     values = jax.lax.stop_gradient(values)
-    return by_form(
-        values,
-        reference=reference.argsort,
-        cpu=cpu.argsort if values.shape[0] > 1 else reference.argsort,  # loops of one step would be unrolled
-        accelerator=accelerator.argsort,
-        like=jax.ShapeDtypeStruct(values.shape, jnp.int32),
-    )
+    if values.dtype.itemsize < 4:  # the keys of the fast forms are as wide as the values, and 32 bits at least
+        values = values.astype(jnp.float32)
+    # A loop of one step would be unrolled, and native calls want loops.
+    cpu_form = cpu if values.shape[0] > 1 else accelerator
+    forms = functions_by_form("argsort", reference=reference, cpu=cpu_form, accelerator=accelerator)
+    return by_form(values, **forms, like=jax.ShapeDtypeStruct(values.shape, jnp.int32))
 
 
 def sort_pairs(tiles: Int[Array, " M"], ranks: Int[Array, " M"], tile_count: int, rank_count: int) -> Pairs:
@@ -32,11 +31,5 @@ def sort_pairs(tiles: Int[Array, " M"], ranks: Int[Array, " M"], tile_count: int
         rank_count: how many ranks there are.
     """
     counts = {"tile_count": tile_count, "rank_count": rank_count}
-    return by_form(
-        tiles,
-        ranks,
-        reference=lambda tiles, ranks: reference.sort_pairs(tiles, ranks, **counts),
-        cpu=lambda tiles, ranks: cpu.sort_pairs(tiles, ranks, **counts),
-        accelerator=lambda tiles, ranks: accelerator.sort_pairs(tiles, ranks, **counts),
-        like=(tiles, ranks, jax.ShapeDtypeStruct((tile_count + 1,), jnp.int32)),
-    )
+    forms = functions_by_form("sort_pairs", reference=reference, cpu=cpu, accelerator=accelerator, **counts)
+    return by_form(tiles, ranks, **forms, like=(tiles, ranks, jax.ShapeDtypeStruct((tile_count + 1,), jnp.int32)))

@@ -19,8 +19,9 @@ def sort_pairs(
     """See the contract."""
     bits = rank_count.bit_length()
     # Counted and not searched for: a binary search is a chain of dependent steps.
-    sizes = jnp.zeros(tile_count + 1, jnp.int32).at[tiles].add(1)
-    starts = jnp.cumsum(sizes, dtype=jnp.int32) - sizes
+    # Dropped pairs, which are many, are not counted: they would all wait for one address.
+    sizes = jnp.zeros(tile_count, jnp.int32).at[tiles].add(1, mode="drop")
+    starts = jnp.concatenate([jnp.zeros(1, jnp.int32), jnp.cumsum(sizes, dtype=jnp.int32)])
     if bits + tile_count.bit_length() > 32:
         tiles, ranks = jax.lax.sort((tiles, ranks), num_keys=2)
         return tiles, ranks, starts

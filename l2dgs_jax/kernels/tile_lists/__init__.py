@@ -1,12 +1,10 @@
 """Which Gaussians touch which tile, as a list of pairs."""
 
-from functools import partial
-
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from l2dgs_jax.kernels.selection import by_form
+from l2dgs_jax.kernels.selection import by_form, functions_by_form
 from l2dgs_jax.kernels.tile_lists import accelerator, cpu, reference
 from l2dgs_jax.kernels.tiles import Tiling
 
@@ -20,7 +18,7 @@ def list_pairs(
         box: first column and row of tiles around each Gaussian, and numbers of columns and rows, those of all views
             one after the other, as many in each.
         ellipse: mean (2, pixels), conic (3), and the d^T conic d up to which it is seen.
-        tiling: what is static.
+        tiling: sizes fixed at compilation.
 
     Returns:
         `capacity` tiles, numbered view by view and row by row, and rows; the pairs of a tile come in the order of the
@@ -30,9 +28,8 @@ def list_pairs(
         nowhere = tiling.views * tiling.columns * tiling.rows
         return jnp.full(tiling.capacity, nowhere, jnp.int32), jnp.zeros(tiling.capacity, jnp.int32)
     box, ellipse = jax.lax.stop_gradient((box, ellipse))
-    forms = {"reference": reference, "cpu": cpu, "accelerator": accelerator}
-    if len(box) < 2:  # a loop of one step would be unrolled, and might no longer use every argument
-        forms["cpu"] = reference
+    # A loop of one step would be unrolled, and native calls want loops.
+    cpu_form = cpu if len(box) > 1 else accelerator
+    forms = functions_by_form("list_pairs", reference=reference, cpu=cpu_form, accelerator=accelerator, tiling=tiling)
     pairs = jax.ShapeDtypeStruct((tiling.capacity,), jnp.int32)
-    functions = {name: partial(form.list_pairs, tiling=tiling) for name, form in forms.items()}
-    return by_form(box, ellipse, **functions, like=(pairs, pairs))
+    return by_form(box, ellipse, **forms, like=(pairs, pairs))

@@ -21,8 +21,8 @@ VOTES = 0.3  # of the comparisons in which a pixel is seen must find it off the 
 LARGEST = 0.6  # a mask that covers more of the picture is a geometry that was not found
 STILL = 1.0  # pixels of flow under which no parallax could be measured
 
-_SPACING = 4  # pixels between the places that the geometry is fitted to
-_FEWEST = 50  # such places
+_SPACING = 4  # pixels between the positions that the geometry is fitted to
+_FEWEST = 50  # such positions
 _CONSISTENT = 1.0  # pixels between a place and where flow forth and back leads
 
 
@@ -64,7 +64,7 @@ def _distances_to_epipolar_lines(
     """Sampson distance in pixels of the flow from each picture to the other; NaN where it is not to be trusted."""
     there, back = _flow(first, second), _flow(second, first)
     forth, returned = match(there, back), match(back, there)
-    here = forth.places - there
+    here = forth.positions - there
     trusted, trusted_back = forth.errors < _CONSISTENT, returned.errors < _CONSISTENT
 
     grid = (slice(_SPACING // 2, None, _SPACING),) * 2
@@ -73,10 +73,10 @@ def _distances_to_epipolar_lines(
     if usable.sum() < _FEWEST:
         return distance, distance_back
     cv2.setRNGSeed(0)
-    F, _ = cv2.findFundamentalMat(here[grid][usable], forth.places[grid][usable], cv2.USAC_MAGSAC, 0.5, 0.999, 5000)
+    F, _ = cv2.findFundamentalMat(here[grid][usable], forth.positions[grid][usable], cv2.USAC_MAGSAC, 0.5, 0.999, 5000)
     if F is not None and F.shape == (3, 3):
-        distance[trusted] = _sampson(F, here[trusted], forth.places[trusted])
-        distance_back[trusted_back] = _sampson(F, returned.places[trusted_back], here[trusted_back])
+        distance[trusted] = _sampson(F, here[trusted], forth.positions[trusted])
+        distance_back[trusted_back] = _sampson(F, returned.positions[trusted_back], here[trusted_back])
     return distance, distance_back
 
 

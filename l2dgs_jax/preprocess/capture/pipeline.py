@@ -20,14 +20,8 @@ from l2dgs_jax.preprocess.capture.structure import CameraModel, Workplace
 from l2dgs_jax.runtime.files import expect_new, new_folder, replacing, write_json
 
 FEWEST_FRAMES = 5
-
-
 FEWEST_REGISTERED = 0.5  # part of the frames
-
-
 LEAST_PARALLAX = 0.05  # part of the pairs of frames that must show some
-
-
 ADVICE = (
     "film more slowly, with more light and more overlap, and walk instead of turning on the spot; "
     "or try more --frames, or another --camera-model"
@@ -62,7 +56,8 @@ def prepare(source: Path, output: Path, cfg: CaptureConfig, curve: Curve = brigh
         source: a video, or a folder of frames whose names count them.
         output: folder to make.
         cfg: how.
-        curve: makes the brighter copies that features and flow are found in.
+        curve: makes the brighter copies that features and flow are found in. Kept work does not know of which curve it
+            is: another one wants another `output`.
 
     Returns:
         The report.

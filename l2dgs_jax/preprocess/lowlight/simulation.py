@@ -23,8 +23,6 @@ Bytes = UInt8[np.ndarray, "H W 3"]
 
 
 MOST = 1e9  # electrons
-
-
 SAMPLE = 1_000_000  # pixels of a video that the analytic curve is fitted to
 
 

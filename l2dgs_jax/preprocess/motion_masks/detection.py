@@ -123,7 +123,7 @@ def contradiction(
     height, width = matches.errors.shape[1:]
     columns, rows = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
     pixels = np.stack([columns, rows], axis=-1) + np.float32(0.5)
-    residuals = static_residuals(geometry, pixels, matches.places, depths)
+    residuals = static_residuals(geometry, pixels, matches.positions, depths)
     returned = matches.errors < 1
     sigmas = np.full(len(residuals[0]), ACCURACY, np.float32)
     for _ in range(2):

@@ -22,8 +22,6 @@ from l2dgs_jax.types import Camera
 from l2dgs_jax.visualize.sheet import sheet
 
 PREVIEW_ROWS = 12
-
-
 PREVIEW_LEVEL = 0.45  # mean that the preview's pictures are brightened to
 
 

@@ -1,0 +1,107 @@
+"""Blending of lists of any lengths: every form, in blocks that are full and that are not, and its gradient."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.test_util import check_grads
+
+from l2dgs_jax.kernels import use_kernels
+from l2dgs_jax.kernels.blend import accelerator, blend
+from l2dgs_jax.kernels.tiles import TILE, TileLists
+
+WIDTH, HEIGHT = 5 * TILE - 3, 2 * TILE
+TILES, COUNT, CHANNELS = 10, 30, 3
+LENGTHS = [7, 0, 25, 1, 0, 13, 4, 0, 9, 2]  # of the lists; some are longer than a chunk
+
+
+def case(seed=0):
+    random = np.random.default_rng(seed)
+    mean = random.uniform(0, [WIDTH, HEIGHT], (COUNT, 2))
+    conic = np.tile([0.02, 0.004, 0.03], (COUNT, 1)) * random.uniform(0.5, 2, (COUNT, 1))
+    opacity = random.uniform(0.1, 1, (COUNT, 1))
+    packed = np.concatenate([mean, conic, opacity, random.normal(size=(COUNT, CHANNELS))], axis=1)
+    chosen = np.concatenate([random.permutation(COUNT)[:length] for length in LENGTHS])
+    spare = random.integers(0, COUNT, 6)  # beyond the last list, as in a buffer that is not full
+    stops = np.cumsum(LENGTHS)
+    starts = stops - LENGTHS
+    lists = TileLists(*(jnp.asarray(x, jnp.int32) for x in (np.concatenate([chosen, spare]), starts, stops)))
+    return jnp.asarray(packed), lists
+
+
+def with_gradient(packed, lists, cotangent):
+    value, pull = jax.vjp(lambda packed: blend(packed, lists, WIDTH, HEIGHT), packed)
+    return value, pull(cotangent)[0]
+
+
+def one_by_one(packed, lists):
+    """Every pixel on its own."""
+    packed, columns = np.asarray(packed), -(-WIDTH // TILE)
+    image = np.zeros((TILES, CHANNELS, TILE * TILE))
+    for tile, (start, stop) in enumerate(zip(lists.starts, lists.stops, strict=True)):
+        for pixel in range(TILE * TILE):
+            x = TILE * (tile % columns) + pixel % TILE + 0.5
+            y = TILE * (tile // columns) + pixel // TILE + 0.5
+            light = 1.0
+            for mx, my, a, b, c, opacity, *features in packed[np.asarray(lists.gaussians[start:stop])]:
+                dx, dy = x - mx, y - my
+                alpha = min(0.999, opacity * np.exp(-0.5 * (a * dx * dx + 2 * b * dx * dy + c * dy * dy)))
+                if alpha < 1 / 255:
+                    continue
+                if light * (1 - alpha) <= 1e-4:
+                    break
+                image[tile, :, pixel] += light * alpha * np.array(features)
+                light *= 1 - alpha
+    return image
+
+
+def test_the_reference_is_the_definition():
+    packed, lists = case()
+    with use_kernels("reference"):
+        np.testing.assert_allclose(blend(packed, lists, WIDTH, HEIGHT), one_by_one(packed, lists), atol=1e-12)
+        few = lists._replace(stops=jnp.minimum(lists.stops, lists.starts + 2))
+        check_grads(jax.jit(lambda p: blend(p, few, WIDTH, HEIGHT)), (0.4 * packed,), 1, ["rev"], eps=1e-6)
+
+
+@pytest.mark.parametrize("block", [None, 1, 3, 4])
+def test_every_form_is_the_reference_whatever_the_blocks(any_form, monkeypatch, block):
+    if block is not None:
+        if any_form != "accelerator":
+            pytest.skip("other forms have blocks of one size")
+        monkeypatch.setattr(accelerator, "BLOCK", block)
+        jax.clear_caches()
+    packed, lists = case()
+    cotangent = jnp.asarray(np.random.default_rng(1).normal(size=(TILES, CHANNELS, TILE * TILE)))
+    with use_kernels("reference"):
+        expected = with_gradient(packed, lists, cotangent)
+    for actual, wanted in zip(jax.jit(with_gradient)(packed, lists, cotangent), expected, strict=True):
+        np.testing.assert_allclose(actual, wanted, rtol=1e-10, atol=1e-12)
+
+
+def test_batches_are_one_larger_image(any_form):
+    cases = [case(seed) for seed in range(2)]
+    packed, lists = (jax.tree.map(lambda *x: jnp.stack(x), *x) for x in zip(*cases, strict=True))
+    cotangent = jnp.ones((TILES, CHANNELS, TILE * TILE))
+    together = jax.jit(jax.vmap(with_gradient, (0, 0, None)))(packed, lists, cotangent)
+    with use_kernels("reference"):
+        alone = [with_gradient(*arrays, cotangent) for arrays in cases]
+    for actual, wanted in zip(together, map(jnp.stack, zip(*alone, strict=True)), strict=True):
+        np.testing.assert_allclose(actual, wanted, rtol=1e-10, atol=1e-12)
+
+
+def test_no_gaussian_at_all(any_form):
+    packed, lists = case()
+    nothing = TileLists(lists.gaussians[:1], 0 * lists.starts, 0 * lists.stops)
+    value, gradient = with_gradient(packed[:0], nothing, jnp.ones((TILES, CHANNELS, TILE * TILE)))
+    assert not value.any()
+    assert gradient.shape == (0, packed.shape[1])
+    # Empty lists of Gaussians that exist.
+    value, gradient = jax.jit(with_gradient)(packed, nothing, jnp.ones((TILES, CHANNELS, TILE * TILE)))
+    assert not value.any()
+    assert not gradient.any()
+
+
+def test_a_nan_shows(any_form):
+    packed, lists = case()
+    which = int(lists.gaussians[0])
+    assert np.isnan(jax.jit(lambda p: blend(p, lists, WIDTH, HEIGHT))(packed.at[which, 0].set(jnp.nan))[0]).any()
