@@ -1,1 +1,1 @@
-from forms import any_form  # noqa: F401
+from forms import any_form, any_way  # noqa: F401

@@ -34,6 +34,9 @@ def with_gradient(packed, lists, cotangent):
     return value, pull(cotangent)[0]
 
 
+compiled = jax.jit(with_gradient)
+
+
 def one_by_one(packed, lists):
     """Every pixel on its own."""
     packed, columns = np.asarray(packed), -(-WIDTH // TILE)
@@ -63,19 +66,39 @@ def test_the_reference_is_the_definition():
         check_grads(jax.jit(lambda p: blend(p, few, WIDTH, HEIGHT)), (0.4 * packed,), 1, ["rev"], eps=1e-6)
 
 
-@pytest.mark.parametrize("block", [None, 1, 3, 4])
-def test_every_form_is_the_reference_whatever_the_blocks(any_form, monkeypatch, block):
-    if block is not None:
-        if any_form != "accelerator":
-            pytest.skip("other forms have blocks of one size")
-        monkeypatch.setattr(accelerator, "BLOCK", block)
-        jax.clear_caches()
+def assert_the_reference():
     packed, lists = case()
     cotangent = jnp.asarray(np.random.default_rng(1).normal(size=(TILES, CHANNELS, TILE * TILE)))
+    actual = compiled(packed, lists, cotangent)
     with use_kernels("reference"):
-        expected = with_gradient(packed, lists, cotangent)
-    for actual, wanted in zip(jax.jit(with_gradient)(packed, lists, cotangent), expected, strict=True):
-        np.testing.assert_allclose(actual, wanted, rtol=1e-10, atol=1e-12)
+        expected = compiled(packed, lists, cotangent)
+    for a, e in zip(actual, expected, strict=True):
+        np.testing.assert_allclose(a, e, rtol=1e-10, atol=1e-12)
+
+
+def test_every_form_is_the_reference(any_way):
+    assert_the_reference()
+
+
+@pytest.mark.parametrize("block", [3, 5])
+def test_blocks_that_are_full_and_that_are_not(monkeypatch, block):
+    monkeypatch.setattr(accelerator, "BLOCK", block)
+    packed, lists = case(seed=block)
+    cotangent = jnp.ones((TILES, CHANNELS, TILE * TILE))
+    with use_kernels("accelerator"):
+        actual = jax.jit(lambda *arrays: with_gradient(*arrays))(packed, lists, cotangent)  # with these blocks
+    with use_kernels("reference"):
+        expected = compiled(packed, lists, cotangent)
+    for a, e in zip(actual, expected, strict=True):
+        np.testing.assert_allclose(a, e, rtol=1e-10, atol=1e-12)
+
+
+def test_a_single_gaussian(any_form):
+    packed, lists = case()
+    alone = lists._replace(gaussians=0 * lists.gaussians, stops=jnp.minimum(lists.stops, lists.starts + 1))
+    value, gradient = compiled(packed[:1], alone, jnp.ones((TILES, CHANNELS, TILE * TILE)))
+    np.testing.assert_allclose(value, one_by_one(packed[:1], alone), atol=1e-12)
+    assert np.isfinite(gradient).all()
 
 
 def test_batches_are_one_larger_image(any_form):
@@ -84,7 +107,7 @@ def test_batches_are_one_larger_image(any_form):
     cotangent = jnp.ones((TILES, CHANNELS, TILE * TILE))
     together = jax.jit(jax.vmap(with_gradient, (0, 0, None)))(packed, lists, cotangent)
     with use_kernels("reference"):
-        alone = [with_gradient(*arrays, cotangent) for arrays in cases]
+        alone = [compiled(*arrays, cotangent) for arrays in cases]
     for actual, wanted in zip(together, map(jnp.stack, zip(*alone, strict=True)), strict=True):
         np.testing.assert_allclose(actual, wanted, rtol=1e-10, atol=1e-12)
 
@@ -96,7 +119,7 @@ def test_no_gaussian_at_all(any_form):
     assert not value.any()
     assert gradient.shape == (0, packed.shape[1])
     # Empty lists of Gaussians that exist.
-    value, gradient = jax.jit(with_gradient)(packed, nothing, jnp.ones((TILES, CHANNELS, TILE * TILE)))
+    value, gradient = compiled(packed, nothing, jnp.ones((TILES, CHANNELS, TILE * TILE)))
     assert not value.any()
     assert not gradient.any()
 

@@ -35,7 +35,7 @@ def assert_close(actual, expected):
 
 
 @pytest.mark.parametrize("shape", SHAPES, ids=str)
-def test_every_form_agrees_with_the_general_convolution(any_form, shape):
+def test_every_form_agrees_with_the_general_convolution(any_way, shape):
     arrays = case(*shape)
     assert_close(jax.jit(with_gradients(convolve))(*arrays), with_gradients(plain)(*arrays))
 

@@ -1,5 +1,7 @@
 """Lookups in planes and lines: every form, its gradients and batches against the reference."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -22,6 +24,7 @@ def case(points=POINTS, seed=0):
     return space, lines, cell, weight
 
 
+@functools.cache
 def with_gradients(layout):
     def run(space, lines, cell, weight, cotangent):
         found, pull = jax.vjp(
@@ -36,9 +39,10 @@ def assert_close(actual, expected):
     jax.tree.map(lambda a, e: np.testing.assert_allclose(a, e, rtol=1e-12, atol=1e-13), actual, expected)
 
 
-@pytest.mark.parametrize("points", [0, 1, POINTS])
-@pytest.mark.parametrize("aggregation", ["paired_sum", "product"])
-def test_every_form_is_the_reference(any_form, aggregation, points):
+@pytest.mark.parametrize(
+    ("aggregation", "points"), [("paired_sum", POINTS), ("product", POINTS), ("product", 1), ("product", 0)]
+)
+def test_every_form_is_the_reference(any_way, aggregation, points):
     layout = Layout(SIZES, VIEWS, aggregation)
     arrays = case(points)
     cotangent = jnp.asarray(np.random.default_rng(1).normal(size=(VIEWS, 2 * points, CHANNELS)))

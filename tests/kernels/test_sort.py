@@ -32,7 +32,7 @@ def test_argsort_in_a_batch_and_of_hardly_anything(any_form):
 
 @pytest.mark.parametrize("rank_count", [400, 2**31], ids=["one key", "two keys"])
 @pytest.mark.parametrize("tile_count", [1, 7, 1000])
-def test_pairs_are_sorted_by_tile_and_rank(any_form, tile_count, rank_count):
+def test_pairs_are_sorted_by_tile_and_rank(any_way, tile_count, rank_count):
     random = np.random.default_rng(tile_count)
     tiles, ranks = random.integers(0, tile_count + 1, 400).astype(np.int32), np.arange(400, dtype=np.int32)
     order = np.lexsort((ranks, tiles))

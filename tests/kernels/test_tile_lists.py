@@ -35,7 +35,7 @@ def listed(box, ellipse, capacity=VIEWS * COUNT * COLUMNS * ROWS):
     return [(int(t), int(r)) for t, r in zip(tile, row, strict=True) if t < NOWHERE], tile
 
 
-def test_pairs_are_those_that_touch(any_form):
+def test_pairs_are_those_that_touch(any_way):
     box, ellipse = gaussians()
     pairs, _ = listed(box, ellipse)
     expected = set()

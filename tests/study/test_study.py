@@ -85,7 +85,7 @@ def test_scenes_alone_are_a_study(study):
         ('scenes = ["a"]\n[settings]\nloss.nonsense = 1', "loss.nonsense"),
         ('scenes = ["a"]\n[settings]\nloss.ssim = "much"', "loss.ssim"),
         ('scenes = ["a"]\n[settings]\nseed = 1', "seeds"),
-        ('scenes = ["a"]\n[settings]\ncoarse_steps = 0\nfine_steps = 0', "coarse_steps"),
+        ('scenes = ["a"]\n[settings]\ncoarse_steps = 0\nfine_steps = 0', "--coarse-steps"),
         ('scenes = ["a"]\n[grid]\nloss.ssim = 1.0', "loss.ssim"),
         ('scenes = ["a"]\n[grid]\nloss.ssim = []', "loss.ssim"),
         ('scenes = ["a"]\n[grid]\nloss.ssim = [1.0, "x"]', "loss.ssim"),

@@ -20,7 +20,7 @@ CHUNKING = Chunking(size=8, unroll=False)
 
 def blend(packed: Float[Array, "G D"], lists: TileLists, *, width: int, height: int) -> Float[Array, "T C P"]:
     """See the contract."""
-    if lists.starts.shape[0] <= BLOCK:  # `native_call` wants loops that the compiler cannot unroll
+    if not _suits(packed, lists):
         return accelerator.blend(packed, lists, width=width, height=height)
     blocks, _, position = in_blocks(lists, BLOCK, width, height, packed.dtype)
 
@@ -41,7 +41,7 @@ def gradient(
     height: int,
 ) -> Float[Array, "G D"]:
     """The gradient of `blend` in `packed`."""
-    if lists.starts.shape[0] <= BLOCK:
+    if not _suits(packed, lists):
         return accelerator.gradient(packed, lists, output, cotangent, width=width, height=height)
     blocks, tiles, _ = in_blocks(lists, BLOCK, width, height, packed.dtype)
 
@@ -59,3 +59,8 @@ def gradient(
 def _add_rows(sums: Sums, ids: Int[Array, "K B"], listed: Bool[Array, "K B"], rows: Float[Array, "K B D"]) -> Sums:
     del listed  # rows beyond a list's end are zero: to leave them out takes longer than to add them
     return loops.add_rows(sums, ids, rows)
+
+
+def _suits(packed: Float[Array, "G D"], lists: TileLists) -> bool:
+    """Whether a native call can do it: that wants loops of several steps, and indices that are not all the same."""
+    return lists.starts.shape[0] > BLOCK and len(packed) > 1
