@@ -11,8 +11,8 @@ import time
 import pytest
 from scenes import write_nerfies
 
-from l2dgs_jax import runs, sweep
-from l2dgs_jax.study import report
+from l2dgs_jax import runs
+from l2dgs_jax.study import report, running
 
 STUDY = """
 scenes = ["a", "b"]
@@ -173,4 +173,4 @@ def test_a_member_that_diverges_is_frozen_and_reported(start, whole, study, tmp_
         same = next(member for key, member in found.items() if key[3:] == name[3:])
         assert same["scores"]["lowlight"] == pytest.approx(expected["scores"]["lowlight"], 1e-3, 1e-5)
     frozen = next(folder for folder in (tmp_path / "out").glob("*wild"))
-    assert json.loads((frozen / sweep.DIVERGED).read_text())["step"] == int(runs.open_run(frozen).state.step)
+    assert json.loads((frozen / running.DIVERGED).read_text())["step"] == int(runs.open_run(frozen).state.step)
