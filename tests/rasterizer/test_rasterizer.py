@@ -12,6 +12,9 @@ from l2dgs_jax.rasterizer import rasterize
 from l2dgs_jax.rasterizer.reference import rasterize_dense
 
 GOLDEN = Path(__file__).parent / "golden"
+# The other forms take a compilation each: their differences show in tests/kernels, and here at length.
+ACCELERATOR = pytest.param("accelerator", marks=pytest.mark.slow)
+REFERENCE = pytest.param("reference", marks=pytest.mark.slow)
 NAMES = ("means", "quats", "scales", "opacities", "features", "viewmat", "K")
 WIDTH, HEIGHT, CAPACITY = 37, 23, 4096  # enough tiles for the form that CPUs run
 
@@ -91,7 +94,7 @@ def golden_loss(arrays, weights, width, height):
         ("s500_96x64", jnp.float32, None),
         ("s500o_96x64", jnp.float32, None),
         ("s2000_160x96", jnp.float32, None),
-        ("s500_96x64", jnp.float32, "accelerator"),
+        pytest.param("s500_96x64", jnp.float32, "accelerator", marks=pytest.mark.slow),
         ("s500o_96x64", jnp.float32, "accelerator"),
         pytest.param("s500o_96x64", jnp.float64, "reference", marks=pytest.mark.slow),
     ],
@@ -133,7 +136,7 @@ def test_an_image_of_one_pixel():
     assert all(np.all(np.isfinite(x)) and np.any(x != 0) for x in gradients)
 
 
-@pytest.mark.parametrize("form", ["reference", "accelerator"])
+@pytest.mark.parametrize("form", [REFERENCE, "accelerator"])
 def test_every_form_agrees(form):
     arrays = scene(13)
     values, gradients = fast(*arrays)
@@ -162,7 +165,7 @@ def test_numerical_gradients():
     )
 
 
-@pytest.mark.parametrize("form", [None, "accelerator"])
+@pytest.mark.parametrize("form", [None, ACCELERATOR])
 @pytest.mark.parametrize("batch", [fast, jax.jit(jax.vmap(fast))], ids=["views", "vmap"])
 def test_a_batch_equals_a_loop(batch, form):
     arrays = stacked(range(3))
@@ -210,7 +213,7 @@ def test_the_near_plane_hides_and_the_blur_widens():
         np.testing.assert_allclose(alpha[8, 9], np.exp(-0.5 / eps2d), rtol=1e-5)
 
 
-@pytest.mark.parametrize("form", [None, "accelerator"])
+@pytest.mark.parametrize("form", [None, ACCELERATOR])
 def test_nothing_at_all_is_black(form):
     means, quats, scales, opacities, features, viewmat, K = scene(1)
     empty = [x[:0] for x in (means, quats, scales, opacities, features)]
@@ -257,7 +260,7 @@ def test_nothing_is_drawn_behind_the_camera():
         assert np.all(x == 0)
 
 
-@pytest.mark.parametrize("form", [None, "reference", "accelerator"])
+@pytest.mark.parametrize("form", [None, REFERENCE, ACCELERATOR])
 def test_nan_is_not_hidden(form):
     arrays = list(scene(8))
     for position in range(5):
@@ -290,7 +293,7 @@ def test_probe_moves_the_centres():
     assert_close((probed.features, probed.alpha, probed.depth), shifted)
 
 
-@pytest.mark.parametrize("form", [None, "accelerator"])
+@pytest.mark.parametrize("form", [None, ACCELERATOR])
 def test_overflow_is_reported(form):
     with use_kernels(form):
         check_overflow(scene(3))

@@ -183,6 +183,7 @@ def test_the_optimizer_starts_anew_with_the_fine_stage_and_not_when_a_run_goes_o
     assert not any(x.any() for x in jax.tree.leaves(states[COARSE + 1].adam.mu))
 
 
+@pytest.mark.slow
 def test_every_rate_moves_its_parameters_and_no_others(dataset):
     config = config_of()
     state, batch = initial_state(dataset, config), batch_of(dataset)
