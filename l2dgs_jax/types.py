@@ -33,6 +33,7 @@ class Gaussians(NamedTuple):
         illumination_rest: SH coefficients b_2 ... b_J of Eq. 2.
         reflectance: r of Eq. 6.
         attenuation: brightness attenuation features (b1, b2) of Eq. 8.
+        gate: how much of the motion field acts, before the sigmoid; None: all of it.
     """
 
     means: Float[Array, "*B N 3"]
@@ -43,6 +44,7 @@ class Gaussians(NamedTuple):
     illumination_rest: Float[Array, "*B N J1"]
     reflectance: Float[Array, "*B N 3"]
     attenuation: Float[Array, "*B N 2"]
+    gate: Float[Array, "*B N"] | None = None
 
 
 class MovedGaussians(NamedTuple):
@@ -155,7 +157,7 @@ class Scene(NamedTuple):
         params: learned values.
         alive: which Gaussians exist.
         bounds: lowest and highest corner of the HexPlane's box, world units, not learned.
-        extent: radius of the camera path, world units: the length that position steps scale with.
+        extent: the length that position steps scale with, world units (`ModelConfig.unit`).
     """
 
     params: SceneParams

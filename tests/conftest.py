@@ -1,5 +1,10 @@
 """Every test runs in float64 unless it says otherwise, with shapes and dtypes checked at run time."""
 
+import os
+
+# Most of a test's time is compilation, and most of that is optimisation. Whoever sets the variable decides.
+os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
+
 import jax
 from jaxtyping import install_import_hook
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import skimage
 
 import l2dgs_jax
 from l2dgs_jax import runs
@@ -66,6 +67,7 @@ def test_the_readmes_programs_run_as_printed(tmp_path, monkeypatch):
     exec(opened, names)
     assert names["view"].images.welllit.shape == (192, 256, 3)
     assert names["large"].images.welllit.shape == (384, 512, 3)
+    assert skimage.io.imread("large.png").shape == (384, 512, 3)
     smaller = names["large"].alpha.reshape(192, 2, 256, 2).mean((1, 3))
     assert np.abs(smaller - names["view"].alpha).mean() < 0.05
 

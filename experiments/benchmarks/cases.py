@@ -198,7 +198,7 @@ CASES: dict[str, Callable[[], Figures]] = {
 
 @jax.jit
 def _move(scene: Scene, cameras: Camera) -> MovedGaussians:
-    return deform(scene.params, scene.alive, scene.bounds, cameras, CONFIG.model, moving=True, sh_degree_active=3)
+    return deform(scene, cameras, CONFIG.model, moving=True, sh_degree_active=3)
 
 
 def _rasterizer(count: int, width: int, height: int) -> tuple[Callable, Callable, int]:

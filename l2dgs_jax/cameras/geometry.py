@@ -23,6 +23,20 @@ def camera_extent(cameras: Camera) -> float:
     return float(1.1 * np.linalg.norm(centres - centres.mean(0), axis=-1).max())
 
 
+def median_depth(cameras: Camera, points: Float[np.ndarray, "P 3"]) -> float:
+    """Median over the cameras of the median depth of the points in front of each, world units.
+
+    Raises:
+        ValueError: no point lies in front of a camera.
+    """
+    viewmats = np.asarray(cameras.viewmat, np.float64)
+    depths = [points @ viewmat[2, :3] + viewmat[2, 3] for viewmat in viewmats]
+    medians = [np.median(depth[depth > 0]) for depth in depths if (depth > 0).any()]
+    if not medians:
+        raise ValueError("no point lies in front of a camera")
+    return float(np.median(medians))
+
+
 def select_camera(cameras: Camera, index: int) -> Camera:
     """One camera of a batch."""
     return Camera(*(x[index] for x in cameras))

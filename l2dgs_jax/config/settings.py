@@ -29,17 +29,20 @@ def _arg(kind: Any) -> Any:
 
 _PLAIN_NUMBER, _PLAIN_COUNT, _PLAIN_LENGTH = float, int, int | None
 _PLAIN_EXPONENTS = tuple[float | Literal["auto"], float] | None
+_PLAIN_MOST = int | Literal["auto"]
 _PLAIN_ILLUMINATION = float | Literal["auto"] | None
 Number = Annotated[_Float, _arg(_PLAIN_NUMBER)]
 Count = Annotated[_Int, _arg(_PLAIN_COUNT)]
 Length = Annotated[_Int | None, _arg(_PLAIN_LENGTH)]
 Exponents = Annotated[tuple[_Float | Literal["auto"], _Float] | None, _arg(_PLAIN_EXPONENTS)]
+Most = Annotated[_Int | Literal["auto"], _arg(_PLAIN_MOST)]
 Illumination = Annotated[_Float | Literal["auto"] | None, _arg(_PLAIN_ILLUMINATION)]
 TRACEABLE: dict[Any, Any] = {
     Number: _PLAIN_NUMBER,
     Count: _PLAIN_COUNT,
     Length: _PLAIN_LENGTH,
     Exponents: _PLAIN_EXPONENTS,
+    Most: _PLAIN_MOST,
     Illumination: _PLAIN_ILLUMINATION,
 }
 
@@ -58,6 +61,7 @@ RATE_GROUPS = (
     "opacities",
     "scales",
     "quats",
+    "gate",
 )
 
 
@@ -65,15 +69,21 @@ RATE_GROUPS = (
 class ModelConfig:
     """Shape and initial state of a scene."""
 
+    # What lengths are measured in, and what the extent is that rates of positions scale with: "world" units, and the
+    # radius of the camera path (3DGS); or "depth", a quarter of the median depth of the points, for both.
+    unit: Literal["world", "depth"] = "world"
     sh_degree: int = 3  # bands k of Eq. 2; (k+1)^2 coefficients
     plane_size: int = 64  # cells of a spatial axis at the coarsest scale
     plane_scales: tuple[int, ...] = (1, 2, 4)  # factors on plane_size, concatenated; time is never scaled
     plane_channels: int = 16
+    box_points: Number = 1.0  # share of the points, along each axis, that the planes' box spans
+    box_rim: float = 0.0  # share of the planes' cells for what lies beyond, contracted; 0: it takes the box's border
     time_size: int | None = None  # cells of the time axis; None: half the number of training frames
     time_range: Literal["full", "upper"] = "full"  # "upper": t in [0, 1] read as [-1, 1], half of each time plane
     aggregation: Literal["paired_sum", "product"] = "paired_sum"  # Eq. 1, or the product of all six planes
     hidden: int = 128  # width of g, of the heads and of OCD-Net
     opacity_head: bool = False  # a fourth head moves the opacity's logit, as 4DGS can (arXiv 2310.08528)
+    motion_gate: bool = False  # a factor a Gaussian in (0, 1) on all that the motion field does to it
     identity_start: bool = False  # heads and OCD-Net start as "no motion, a_j = 1" instead of at random
     illumination_offset: Number = 0.5  # l = max(offset + sum a_j b_j B_j, 0)
     # N(0, 1), U(0, 1), or the frames' colours at the points, with the darkening of model/tone.py undone
@@ -114,6 +124,9 @@ class LossConfig:
     plane_smoothness: Number = 2e-4  # second differences along the space planes' first axis, fine stage only
     time_smoothness: Number = 1e-3  # second differences in t
     time_l1: Number = 1e-4  # mean |1 - plane| of the time planes
+    opacity: Number = 0.0  # mean opacity
+    scale: Number = 0.0  # mean scale, in the unit of lengths
+    gate: Number = 0.0  # mean factor on motion, fine stage only
 
 
 @dataclass(frozen=True)
@@ -142,6 +155,7 @@ class OptimConfig:
     opacity_lr: Number = 0.05
     scales_lr: Number = 5e-3
     quats_lr: Number = 1e-3
+    gate_lr: Number = 0.01
     decay_steps: Length = 20_000  # length of the decays; None: the length of the stage
     beta1: Number = 0.9
     beta2: Number = 0.999
@@ -155,17 +169,21 @@ class OptimConfig:
 
 @dataclass(frozen=True)
 class DensityConfig:
-    """Clone, split and prune (3D Gaussian Splatting, arXiv 2308.04079, as 4DGS sets it)."""
+    """How the number of Gaussians follows the image."""
 
+    # "adaptive": clone, split and prune (3D Gaussian Splatting, arXiv 2308.04079, as 4DGS sets it); "mcmc": relocation
+    # and noise in a fixed capacity (arXiv 2404.09591)
+    method: Literal["adaptive", "mcmc"] = "adaptive"
     start: int = 500  # of each stage, steps
     stop: int = 10_000
     interval: int = 100
     grad_threshold: Number = 2e-4  # mean norm of dL/d(mean2d), normalised device coordinates
     clone_below: Number = 0.01  # of the extent; larger Gaussians split
     conserve_opacity: bool = False  # a new pair covers as much as its source did (arXiv 2404.06109)
-    prune_opacity: Number = 0.005
+    prune_opacity: Number = 0.005  # below it a Gaussian is removed, or moved to where it is needed
     prune_above: Count = 0  # prune only when more Gaussians than this exist
-    max_gaussians: Count = 360_000
+    max_gaussians: Most = 360_000  # "auto": half a Gaussian a pixel of a frame, but at least the points
+    noise: Number = 5e5  # "mcmc": on the centres of faint Gaussians, times their learning rate
 
 
 @dataclass(frozen=True)
@@ -179,7 +197,7 @@ class Config:
     downscale: int = 1  # reads images at 1/downscale of their full size
     format: Layout = "auto"  # of the scene's folder; "auto": found from its contents
     held_out: str = "auto"  # views not trained on: the scene's own, "4dgs", or k for every k-th (data/splits.py)
-    sh_warmup: int = 1000  # steps between activating one more SH band
+    sh_warmup: int | None = 1000  # steps between activating one more SH band; None: all by half of the run
     checkpoint_every: int = 500  # steps
     frame_memory: float = 4.0  # GiB that a scene's frames may take; beyond it they lie in temporary files
     model: ModelConfig = field(default_factory=ModelConfig)
@@ -192,12 +210,16 @@ class Config:
         """Length of the whole run."""
         return self.coarse_steps + self.fine_steps
 
-    def check_steps(self) -> None:
-        """Complain of numbers of steps that make no training.
+    def check_counts(self) -> None:
+        """Complain of numbers that make no training.
 
         Raises:
-            UserError: one is negative, or both are zero.
+            UserError: a number of steps is negative, or both are zero; a step has no views; or no number of steps lies
+                between checkpoints.
         """
+        for name, count in (("--batch-size", self.batch_size), ("--checkpoint-every", self.checkpoint_every)):
+            if count < 1:
+                raise UserError(f"{name} {count}: expected at least 1")
         if self.steps < 1 or min(self.coarse_steps, self.fine_steps) < 0:
             raise UserError("--coarse-steps and --fine-steps: expected no negative number and at least one step in all")
 

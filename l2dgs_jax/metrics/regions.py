@@ -15,14 +15,10 @@ class RegionScore(NamedTuple):
     Attributes:
         psnr: dB.
         ssim: mean of the SSIM map (of the windows inside the image for the whole frame).
-        prediction_square: sum of p^2 over the region's values, p being the prediction and t the truth.
-        product: sum of p t.
     """
 
     psnr: float
     ssim: float
-    prediction_square: float
-    product: float
 
 
 def compare(
@@ -62,16 +58,8 @@ def compare(
         else:
             measure = _masked_ssim if region in ("dynamic", "static") else _partial_ssim
             similarity = measure(prediction, truth, mask)
-        p, t = prediction[mask].astype(np.float64), truth[mask].astype(np.float64)
-        decibels = _psnr(prediction, truth, mask)
-        scores[region] = RegionScore(float(decibels), float(similarity), float(np.sum(p * p)), float(np.sum(p * t)))
+        scores[region] = RegionScore(float(_psnr(prediction, truth, mask)), float(similarity))
     return scores
-
-
-def gain(scores: Sequence[RegionScore]) -> float:
-    """The one factor g = <p, t> / <p, p> that brings predictions p closest to truths t over all scores; 1 if p = 0."""
-    square = sum(score.prediction_square for score in scores)
-    return sum(score.product for score in scores) / square if square else 1.0
 
 
 def summarise(frames: Sequence[dict[str, RegionScore]]) -> dict[str, dict[str, float]]:

@@ -3,18 +3,16 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from l2dgs_jax.cameras.geometry import camera_centres
 from l2dgs_jax.config import ModelConfig
 from l2dgs_jax.model import hexplane, networks, spherical_harmonics
-from l2dgs_jax.types import Camera, Gaussians, MovedGaussians, SceneParams
+from l2dgs_jax.types import Camera, Gaussians, MovedGaussians, Scene
 
 
 def deform(
-    params: SceneParams,
-    alive: Bool[Array, " N"],
-    bounds: Float[Array, "2 3"],
+    scene: Scene,
     cameras: Camera,
     cfg: ModelConfig,
     *,
@@ -23,12 +21,10 @@ def deform(
 ) -> MovedGaussians:
     """Move and light every Gaussian for V cameras, each at its own instant.
 
-    Gradients flow to every leaf of `params` that takes part and to `cameras`; rows that are not alive get none.
+    Gradients flow to every leaf of `scene.params` that takes part and to `cameras`; rows that are not alive get none.
 
     Args:
-        params: learned values; `params.bafe` is not used.
-        alive: which rows exist. The others come out with opacity 0, whatever their parameters.
-        bounds: lowest and highest corner of the HexPlane's box, world units.
+        scene: the scene; rows that are not alive come out with opacity 0, whatever their parameters.
         cameras: V cameras.
         cfg: shape of the scene.
         moving: whether the motion field and OCD-Net act (fine stage); otherwise the canonical Gaussians, with a_j = 1.
@@ -37,6 +33,7 @@ def deform(
     Returns:
         Activated Gaussians; every field has a leading axis V.
     """
+    params, alive = scene.params, scene.alive
     # Garbage in a dead row could overflow the exponential, and 0 * inf would reach the shared networks as NaN.
     gaussians = jax.tree.map(
         lambda rows: jnp.where(alive.reshape(-1, *[1] * (rows.ndim - 1)), rows, 0), params.gaussians
@@ -47,12 +44,19 @@ def deform(
     coefficients = _active_coefficients(gaussians, cfg.sh_degree, sh_degree_active)
     if moving:
         # The same features feed the heads and OCD-Net: Eqs. 1 and 4 name them both f.
-        field = hexplane.features(params.hexplane, gaussians.means, bounds, cameras.time, cfg)
+        field = hexplane.features(params.hexplane, gaussians.means, scene.bounds, cameras.time, cfg)
         hidden, motion = networks.apply_heads(params.heads, field)
-        means, quats, log_scales = means + motion.means, quats + motion.quats, log_scales + motion.log_scales
+        factors = networks.apply_ocd(params.ocd, hidden)
+        if gaussians.gate is not None:
+            gate = jax.nn.sigmoid(gaussians.gate)[None]
+            motion = jax.tree.map(lambda change: gate.reshape(1, -1, *[1] * (change.ndim - 2)) * change, motion)
+            factors = 1 + gate[..., None] * (factors - 1)
+        means += length_unit(scene, cfg) * motion.means
+        quats += motion.quats
+        log_scales += motion.log_scales
         if motion.logit_opacities is not None:
             logit_opacities += motion.logit_opacities
-        coefficients = networks.apply_ocd(params.ocd, hidden) * coefficients
+        coefficients = factors * coefficients
     return MovedGaussians(
         means=means,
         quats=quats,
@@ -62,6 +66,11 @@ def deform(
         reflectance=per_view(gaussians.reflectance),
         attenuation=per_view(gaussians.attenuation),
     )
+
+
+def length_unit(scene: Scene, cfg: ModelConfig) -> Float[Array, ""] | float:
+    """The length that the scene's motion, depths and scales are measured in, world units."""
+    return scene.extent if cfg.unit == "depth" else 1.0
 
 
 def _active_coefficients(gaussians: Gaussians, degree: int, active: Int[Array, ""] | int) -> Float[Array, "1 N J"]:

@@ -50,22 +50,22 @@ def features(
     """Features of every point at every time, before the aggregation g (Eq. 1).
 
     Bilinear, with the first and last cell at the ends of the box and of the time axis. Points outside the box take
-    the feature of the nearest point of it. Gradients flow to `planes`, `points` (zero outside the box) and `times`,
-    in reverse mode only.
+    the feature of the nearest point of it, or with `cfg.box_rim` those of cells of their own. Gradients flow to
+    `planes`, `points` (zero where they are clamped) and `times`, in reverse mode only.
 
     Args:
         planes: the six planes at each scale.
         points: canonical centres, world units.
         bounds: lowest and highest corner of the box; an axis of no extent is ignored.
         times: instants in [0, 1], clamped to it.
-        cfg: `aggregation` and `time_range`.
+        cfg: `aggregation`, `time_range` and `box_rim`.
 
     Returns:
         The scales' features one after the other, F = scales * channels.
     """
     low, high = bounds[:1], bounds[1:]
     thick = high > low
-    unit = jnp.where(thick, jnp.clip((points - low) / jnp.where(thick, high - low, 1), 0, 1), 0)
+    unit = jnp.where(thick, _contract((points - low) / jnp.where(thick, high - low, 1), cfg.box_rim), 0)
     # "upper" reproduces a sampler that expects [-1, 1]: times in [0, 1] then reach only half of the axis.
     times = jnp.clip(times if cfg.time_range == "full" else 0.5 + 0.5 * times, 0, 1)
     layout = Layout(tuple(space.shape[2] for space in planes.space), len(times), cfg.aggregation)
@@ -97,6 +97,20 @@ def regularisers(planes: HexPlane) -> tuple[Float[Array, ""], Float[Array, ""], 
         zero + sum(3 * jnp.mean(jnp.square(bend)) for bend in _second_differences(planes.time)),
         zero + sum(3 * jnp.mean(jnp.abs(1 - stack)) for stack in planes.time),
     )
+
+
+def _contract(unit: Float[Array, "*S"], rim: float) -> Float[Array, "*S"]:
+    """Coordinates of which [0, 1] is the box, all of space brought into [0, 1].
+
+    The box takes the middle 1 - `rim`, and what lies beyond the rest, ever more densely (as Mip-NeRF 360, arXiv
+    2111.12077, does); without a rim it is clamped.
+    """
+    if not rim:
+        return jnp.clip(unit, 0, 1)
+    centred = 2 * unit - 1
+    distance = jnp.maximum(jnp.abs(centred), 1)
+    beyond = jnp.sign(centred) * (1 - rim / (1 + (distance - 1) * (1 - rim) / rim))
+    return 0.5 + 0.5 * jnp.where(jnp.abs(centred) <= 1, (1 - rim) * centred, beyond)
 
 
 def _second_differences(stacks: tuple[Float[Array, "3 _ _ C"], ...]) -> list[Float[Array, "3 _ _ C"]]:

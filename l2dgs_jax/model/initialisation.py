@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray, Shaped
 from scipy.spatial import cKDTree
 from scipy.special import logit
 
-from l2dgs_jax.cameras.geometry import camera_extent
+from l2dgs_jax.cameras.geometry import camera_extent, median_depth
 from l2dgs_jax.config import ModelConfig
 from l2dgs_jax.data.stacks import pixel_mean, stacked
 from l2dgs_jax.model import hexplane, networks
@@ -20,6 +20,9 @@ from l2dgs_jax.types import Camera, Gaussians, Scene, SceneParams
 
 SH_DC = 0.28209479177387814  # value of the first SH basis function
 LUMINANCE = np.array([0.2989, 0.587, 0.114])
+OPEN_GATE = 2.0  # logit of the factor on motion that every Gaussian starts with
+DEPTHS_PER_EXTENT = 0.25  # about the radius of a hand-held camera's path
+LEAST_SPACING = 1e-7**0.5  # of points, for the scales that Gaussians start with
 SEEN_AT_ONCE = 2**26  # colour values of points that `observed_colors` holds in memory
 
 
@@ -54,7 +57,7 @@ def initialise(
         key: randomness of reflectance, attenuation, planes and networks.
         points: [P 3] world units, P <= capacity.
         colors: [P 3] sRGB in [0, 1], or None.
-        cameras: the training cameras, [F]; their number sets the time resolution, their spread the extent.
+        cameras: the training cameras, [F]; their number sets the time resolution.
         cfg: shape and initial state.
         capacity: rows to allocate; those past P are dead.
         reflectance: [P 3] initial reflectance, for `cfg.reflectance_init` "observed".
@@ -67,14 +70,18 @@ def initialise(
     else:
         illumination = np.full(count, 0.5) if colors is None else np.asarray(colors) @ LUMINANCE
     bias = None if cfg.initial_exponents is None else networks.exponent_bias(cfg.initial_exponents)
+    extent = camera_extent(cameras) if cfg.unit == "world" else DEPTHS_PER_EXTENT * median_depth(cameras, points)
+    least = LEAST_SPACING * (extent if cfg.unit == "depth" else 1)
+    rim = (1 - cfg.box_points) / 2
     arrays: tuple = (
         points,
-        0.5 * np.log(np.maximum(mean_square, 1e-7)),
+        np.quantile(points, [rim, 1 - rim], axis=0),
+        np.log(np.maximum(np.sqrt(mean_square), least)),
         illumination - cfg.illumination_offset,
         np.full(count, logit(cfg.initial_opacity)),
         reflectance,
         bias,
-        camera_extent(cameras),
+        extent,
     )
     return _initialise(
         key,
@@ -92,7 +99,10 @@ def scene_shapes(cfg: ModelConfig, num_frames: int) -> Scene:
         cfg: shape of the scene.
         num_frames: training frames.
     """
-    rows = [jax.ShapeDtypeStruct(shape, jnp.zeros(()).dtype) for shape in ((1, 3), (1,), (1,), (1,), (1, 3), (2,), ())]
+    rows = [
+        jax.ShapeDtypeStruct(shape, jnp.zeros(()).dtype)
+        for shape in ((1, 3), (2, 3), (1,), (1,), (1,), (1, 3), (2,), ())
+    ]
     build = partial(_initialise, cfg=_static_settings(cfg), num_frames=num_frames, capacity=1)
     return jax.eval_shape(build, jax.eval_shape(lambda: jax.random.key(0)), *rows)
 
@@ -102,6 +112,7 @@ def _static_settings(cfg: ModelConfig) -> ModelConfig:
     default = ModelConfig()
     return dataclasses.replace(
         cfg,
+        box_points=default.box_points,
         illumination_offset=default.illumination_offset,
         initial_exponents=None,
         initial_illumination=None,
@@ -113,6 +124,7 @@ def _static_settings(cfg: ModelConfig) -> ModelConfig:
 def _initialise(
     key: PRNGKeyArray,
     points: Float[Array, "P 3"],
+    bounds: Float[Array, "2 3"],
     log_scales: Float[Array, " P"],
     illumination: Float[Array, " P"],
     logit_opacities: Float[Array, " P"],
@@ -137,6 +149,7 @@ def _initialise(
         illumination_rest=jnp.zeros((count, (cfg.sh_degree + 1) ** 2 - 1)),
         reflectance=random[cfg.reflectance_init](keys[0], (count, 3)) if reflectance is None else reflectance,
         attenuation=random[cfg.attenuation_init](keys[1], (count, 2)),
+        gate=jnp.full(count, OPEN_GATE) if cfg.motion_gate else None,
     )
     params = SceneParams(
         gaussians=jax.tree.map(lambda rows: pad_rows(rows, capacity), gaussians),
@@ -148,7 +161,7 @@ def _initialise(
     return Scene(
         params=params,
         alive=jnp.arange(capacity) < count,
-        bounds=jnp.stack([points.min(0), points.max(0)]),
+        bounds=bounds,
         extent=extent,
     )
 

@@ -12,9 +12,9 @@ from jaxtyping import Array, Bool, Float, Int
 from l2dgs_jax.config import ModelConfig
 from l2dgs_jax.model import channels
 from l2dgs_jax.model.decomposition import decompose
-from l2dgs_jax.model.deformation import deform
+from l2dgs_jax.model.deformation import deform, length_unit
 from l2dgs_jax.rasterizer import rasterize
-from l2dgs_jax.rasterizer.rasterization import LEAST_ALPHA
+from l2dgs_jax.rasterizer.rasterization import LEAST_ALPHA, NEAR_PLANE
 from l2dgs_jax.runtime.capacity import next_capacity
 from l2dgs_jax.types import Camera, RenderOutput, Scene
 
@@ -48,7 +48,7 @@ def render(
         pair_capacity: size of the rasterizer's pair buffer for all views; None only outside jit.
         means2d_probe: zeros whose gradient is dL/d(mean2d) in pixels.
     """
-    moved = deform(scene.params, scene.alive, scene.bounds, cameras, cfg, moving=moving, sh_degree_active=sh_degree)
+    moved = deform(scene, cameras, cfg, moving=moving, sh_degree_active=sh_degree)
     drawn = rasterize(
         moved.means,
         moved.quats,
@@ -59,6 +59,7 @@ def render(
         cameras.K,
         width,
         height,
+        near_plane=NEAR_PLANE * length_unit(scene, cfg),
         means2d_probe=means2d_probe,
         pair_capacity=pair_capacity,
     )

@@ -9,6 +9,7 @@ from jaxtyping import Array, Bool, Float
 
 from l2dgs_jax.kernels.fusion import fusion_boundary
 
+NEAR_PLANE = 0.01  # world units
 FIELD_MARGIN = 0.3  # of half the field of view: how far outside the image the Jacobian still follows the centre
 
 
@@ -47,7 +48,7 @@ def project(
     K: Float[Array, "3 3"],
     width: int,
     height: int,
-    near_plane: float = 0.01,
+    near_plane: Float[Array, ""] | float = NEAR_PLANE,
     eps2d: float = 0.3,
 ) -> Projected:
     """Project Gaussians by a pinhole camera, to first order around their centres (EWA; 3DGS, arXiv 2308.04079).
@@ -67,7 +68,7 @@ def project(
         eps2d: pixels^2, more than 0, added to the projected covariance, so that no Gaussian falls between pixels.
     """
     size = jnp.array([width, height], means.dtype)
-    visible, depth, normalised = _bounded(_before_camera, near_plane=near_plane)(tuple(means.T), viewmat)
+    visible, depth, normalised = _before_camera(tuple(means.T), viewmat, jnp.asarray(near_plane, means.dtype))
     centre, jacobian = _through_lens(depth, normalised, viewmat, K, size)
     halves = _half(jacobian, _rotation(*_unit(*quats.T)), tuple(scales.T))
     covariance = _bounded(_covariance, eps2d=eps2d)(*halves)
@@ -101,8 +102,9 @@ def _rotation(w: Column, x: Column, y: Column, z: Column) -> tuple[Columns, ...]
     )
 
 
+@fusion_boundary
 def _before_camera(
-    mean: Columns, viewmat: Float[Array, "4 4"], *, near_plane: float
+    mean: Columns, viewmat: Float[Array, "4 4"], near_plane: Float[Array, ""]
 ) -> tuple[Bool[Array, " N"], Column, Columns]:
     """Whether a centre is visible, its depth, and where its ray meets the plane at depth 1."""
     x, y, z = (sum(viewmat[row, k] * mean[k] for k in range(3)) + viewmat[row, 3] for row in range(3))

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, Int
 from l2dgs_jax.kernels.blend import blend
 from l2dgs_jax.kernels.fusion import fusion_boundary
 from l2dgs_jax.kernels.tiles import TILE, grid
-from l2dgs_jax.rasterizer.projection import Projected, project
+from l2dgs_jax.rasterizer.projection import NEAR_PLANE, Projected, project
 from l2dgs_jax.rasterizer.tile_lists import Footprints, footprints, intersect, pairs_needed
 from l2dgs_jax.types import RasterOutput
 
@@ -28,7 +28,7 @@ def rasterize(
     width: int,
     height: int,
     *,
-    near_plane: float = 0.01,
+    near_plane: Float[Array, ""] | float = NEAR_PLANE,
     eps2d: float = 0.3,
     depth_mode: Literal["accumulated", "expected"] = "accumulated",
     means2d_probe: Float[Array, "*V N 2"] | None = None,
@@ -54,8 +54,8 @@ def rasterize(
         width: pixels.
         height: pixels.
         near_plane: world units, more than 0; Gaussians whose centre is nearer to the camera's plane are not drawn.
-            Every value is a compilation.
-        eps2d: pixels^2, more than 0, added to the projected covariance: no Gaussian falls between pixels. Likewise.
+        eps2d: pixels^2, more than 0, added to the projected covariance: no Gaussian falls between pixels. Every value
+            is a compilation.
         depth_mode: depth along the camera's z axis, world units, as "accumulated", the sum of w z over the Gaussians of
             a pixel, or "expected", that sum over their accumulated opacity.
         means2d_probe: added to the projected centres, pixels; zeros, whose gradient is dL/d(mean2d).
@@ -103,7 +103,7 @@ def _prepare(
     probe: Float[Array, "V N 2"] | None,
     width: int,
     height: int,
-    near_plane: float,
+    near_plane: Float[Array, ""] | float,
     eps2d: float,
 ) -> tuple[Projected, Footprints]:
     view = partial(project, width=width, height=height, near_plane=near_plane, eps2d=eps2d)
@@ -113,7 +113,7 @@ def _prepare(
     return projected, footprints(*jax.lax.stop_gradient((projected, opacities)), width, height)
 
 
-@partial(jax.jit, static_argnames=("width", "height", "near_plane", "eps2d"))
+@partial(jax.jit, static_argnames=("width", "height", "eps2d"))
 def count_pairs(
     means: Float[Array, "V N 3"],
     quats: Float[Array, "V N 4"],
@@ -124,7 +124,7 @@ def count_pairs(
     width: int,
     height: int,
     *,
-    near_plane: float = 0.01,
+    near_plane: Float[Array, ""] | float = NEAR_PLANE,
     eps2d: float = 0.3,
     means2d_probe: Float[Array, "V N 2"] | None = None,
 ) -> Int[Array, ""]:
@@ -133,7 +133,7 @@ def count_pairs(
     return pairs_needed(_prepare(means, quats, scales, opacities, *cameras)[1])
 
 
-@partial(jax.jit, static_argnames=("width", "height", "near_plane", "eps2d", "capacity"))
+@partial(jax.jit, static_argnames=("width", "height", "eps2d", "capacity"))
 def _rasterize(
     means: Float[Array, "V N 3"],
     quats: Float[Array, "V N 4"],
@@ -146,7 +146,7 @@ def _rasterize(
     *,
     width: int,
     height: int,
-    near_plane: float,
+    near_plane: Float[Array, ""] | float,
     eps2d: float,
     capacity: int,
 ) -> RasterOutput:

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.lib import format as npy
 
-from l2dgs_jax.config import EXECUTION, Config, to_dict
+from l2dgs_jax.config import EXECUTION, Config, from_dict, to_dict
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.runtime.files import replacing
 from l2dgs_jax.training.initial_state import state_shapes
@@ -58,7 +58,8 @@ def load(path: Path, config: Config, num_frames: int) -> Checkpoint:
     try:
         with zipfile.ZipFile(path) as archive:
             header = json.loads(str(_read(archive, "header")))
-            difference = _first_difference(header["config"], to_dict(config))
+            written = to_dict(from_dict(header["config"]))  # with the defaults of settings that were added since
+            difference = _first_difference(written, to_dict(config))
             if difference:
                 raise UserError(f"{path}: written with other settings ({difference}); expected those of this run")
             misfit = next((name for name, leaf in expected.items() if not _fits(archive, name, leaf)), None)
@@ -70,7 +71,7 @@ def load(path: Path, config: Config, num_frames: int) -> Checkpoint:
             return Checkpoint(jax.tree_util.tree_unflatten(treedef, arrays), header["pair_capacity"])
     except FileNotFoundError:
         raise UserError(f"{path}: no such checkpoint; expected one that train wrote") from None
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile):
         raise UserError(f"{path}: truncated or not a checkpoint; expected a whole file that train wrote") from None
 
 

@@ -36,7 +36,7 @@ def fit(
         ValueError: the views cannot be spread over so many devices, there are not that many, or one of several
             processes would be left without.
     """
-    config.check_steps()
+    config.check_counts()
     devices.one_per_core()
     if device_count is None:
         device_count = devices.shares(config.batch_size)

@@ -44,13 +44,18 @@ class Run:
 
         Args:
             camera: one camera, `K` in pixels of the image wanted; `cameras.resize` makes other sizes of a given one.
-            width: of the image, pixels; the data set's if not given.
+            width: of the image, pixels; the data set's if neither is given.
             height: likewise.
+
+        Raises:
+            ValueError: only one of the two is given.
         """
         return self.renderer(width, height)(camera)
 
     def renderer(self, width: int | None = None, height: int | None = None) -> Renderer:
         """What `render` draws images of a size with."""
+        if (width is None) != (height is None):
+            raise ValueError(f"an image {width} wide and {height} high; expected both numbers, or neither")
         size = width or self.dataset.width, height or self.dataset.height
         if size not in self._renderers:
             self._renderers[size] = Renderer(

@@ -33,7 +33,7 @@ def evaluate(run: Run, split_name: str = "test") -> dict:
           (arXiv 2210.13445) scores it;
         * with truth "welllit": for "overall" and each of those regions the "psnr" and "ssim" of the
           well-lit image as rendered, and "psnr_gain" and "ssim_gain" after it was multiplied by "gain" and clipped to
-          [0, 1]: the one factor for all frames that brings them closest to the truth in the least-squares sense;
+          [0, 1]: the one factor for all frames that, clipping included, leaves the least mean squared error;
         * with truth "dark_frame_gain": "gain", "psnr_gain" and "ssim_gain" of the dark input times its own best factor,
           which is what knowing the exposure alone would score.
 
@@ -83,12 +83,15 @@ def table(result: dict) -> str:
     if "dark_frame_gain" in result:
         rows.append(("dark frame x gain", result["dark_frame_gain"]))
     lines = [f"{result['frames']} {result['split']} views, {result['stage']} stage, step {result['step']}"]
-    lines.append(f"{'':18}{'PSNR':>8}{'SSIM':>8}{'PSNR, gain':>13}{'SSIM, gain':>13}")
+    with_gain = f"{'PSNR, gain':>13}{'SSIM, gain':>13}" if "gain" in result else ""
+    lines.append(f"{'':18}{'PSNR':>8}{'SSIM':>8}{with_gain}")
     formats = (("psnr", 8, "8.2f"), ("ssim", 8, "8.3f"), ("psnr_gain", 13, "13.2f"), ("ssim_gain", 13, "13.3f"))
     for name, scores in rows:
         cells = [format(scores[key], form) if key in scores else " " * width for key, width, form in formats]
         lines.append(f"{name:18}{''.join(cells)}".rstrip())
-    if "gain" in result:
+    if "gain" not in result:
+        lines.append("the scene has no well-lit truth to compare with")
+    else:
         lines.append(f"gain {result['gain']:.3f}, of the dark frame {result['dark_frame_gain']['gain']:.3f}")
     if "mask_area" in result:
         lines.append(f"dynamic region: {100 * result['mask_area']:.1f} % of the pixels")
@@ -102,11 +105,20 @@ def _with_gain(
 ) -> tuple[dict, dict, float]:
     """Scores per region without and with the one best gain, and that gain."""
     plain = [_compare(p, truths, split, i) for i, p in enumerate(predictions)]
-    gain = metrics.gain([frame["overall"] for frame in plain if frame])
+    gain = metrics.best_gain(_counted(predictions, truths, split))
     gained = [_compare(gain * p.astype(np.float32), truths, split, i) for i, p in enumerate(predictions)]
     after = metrics.summarise(gained)
     renamed = {region: {f"{key}_gain": value for key, value in means.items()} for region, means in after.items()}
     return metrics.summarise(plain), renamed, gain
+
+
+def _counted(
+    predictions: Float[np.ndarray, "F H W 3"], truths: Float[np.ndarray, "F H W 3"], split: Split
+) -> Iterator[tuple[Float[np.ndarray, "..."], Float[np.ndarray, "..."]]]:
+    """Prediction and truth of every frame where its pixels count."""
+    for index, prediction in enumerate(predictions):
+        counted = slice(None) if split.valid is None else split.valid[index]
+        yield prediction[counted], truths[index][counted]
 
 
 def _compare(

@@ -69,7 +69,7 @@ def read(path: Path) -> Spec:
         varied = {"seed": seed, **point, **variant}
         try:
             config = overrides.replace(PRESETS[preset], settings | varied)
-            config.check_steps()
+            config.check_counts()
         except UserError as error:
             raise UserError(f"{path}: {error}") from None
         parts = [f"{len(plans):02d}", Path(scene).name, f"seed{seed}", *_labels(point), *([label] if label else [])]

@@ -64,6 +64,11 @@ def accumulate(
     return GrowthStats(stats.gradient + norm, stats.seen + (radii > 0).astype(stats.seen.dtype))
 
 
+def most_gaussians(cfg: DensityConfig) -> Int[Array, ""] | int:
+    """The largest number that may exist; "auto" is resolved by then."""
+    return cfg.max_gaussians  # type: ignore[return-value]
+
+
 def densify(
     gaussians: Gaussians,
     alive: Bool[Array, " N"],
@@ -86,7 +91,7 @@ def densify(
     mean_gradient = stats.gradient / jnp.maximum(stats.seen, 1)
     underfitting = alive_kept & (mean_gradient >= cfg.grad_threshold)
     free = (~alive_kept).sum()
-    budget = jnp.maximum(cfg.max_gaussians - alive_kept.sum(), 0)
+    budget = jnp.maximum(most_gaussians(cfg) - alive_kept.sum(), 0)
     wanted = jnp.minimum(underfitting.sum(), budget)
 
     by_need = jnp.argsort(jnp.where(underfitting, -mean_gradient, jnp.inf))
@@ -117,13 +122,17 @@ def _sample(gaussians: Gaussians, split: Bool[Array, " N"], key: PRNGKeyArray) -
     """Rows of `split` replaced by a smaller Gaussian centred at a sample of themselves; the others unchanged."""
     scales = jnp.exp(gaussians.log_scales)
     local = scales * jax.random.normal(key, scales.shape, scales.dtype)
-    w, x, y, z = jnp.moveaxis(gaussians.quats, -1, 0)
-    # v + 2 q_v x (q_v x v + w v) rotates v by a unit quaternion (w, q_v).
-    norm = jnp.maximum(jnp.linalg.norm(gaussians.quats, axis=-1, keepdims=True), 1e-12)
-    axis, w = jnp.stack([x, y, z], -1) / norm, w[..., None] / norm
-    offset = local + 2 * jnp.cross(axis, jnp.cross(axis, local) + w * local)
+    offset = rotate(gaussians.quats, local)
     pick = split[:, None]
     return gaussians._replace(
         means=jnp.where(pick, gaussians.means + offset, gaussians.means),
         log_scales=jnp.where(pick, gaussians.log_scales - jnp.log(SPLIT_SHRINK), gaussians.log_scales),
     )
+
+
+def rotate(quats: Float[Array, "N 4"], vectors: Float[Array, "N 3"]) -> Float[Array, "N 3"]:
+    """Vectors rotated by quaternions (wxyz) of any norm."""
+    unit = quats / jnp.maximum(jnp.linalg.norm(quats, axis=-1, keepdims=True), 1e-12)
+    w, axis = unit[:, :1], unit[:, 1:]
+    # v + 2 q_v x (q_v x v + w v) rotates v by a unit quaternion (w, q_v).
+    return vectors + 2 * jnp.cross(axis, jnp.cross(axis, vectors) + w * vectors)

@@ -114,8 +114,10 @@ def run(members: Sequence[Member], pair_capacity: int | None = None, mesh: Mesh 
             if not tally.left:
                 raise DivergedError(_complaint(report, step), Progress(step + 1, states, report, pair_capacity))
 
-            if density_due(step + 1 - stage_start, config):
-                states = densify_all(states, values, step + 1, config=static, mesh=mesh)
+            stage_step = step + 1 - stage_start
+            if density_due(stage_step, config):
+                left = growths_left(stage_step, config.fine_steps if moving else config.coarse_steps, config)
+                states = densify_all(states, values, step + 1, left, config=static, mesh=mesh)
             yield Progress(step + 1, states, report, pair_capacity)
 
 
@@ -183,11 +185,11 @@ def begin_fine_stage(
 
 
 def densify_all(
-    states: TrainState, values: dict[str, Any], step: int, *, config: StaticConfig, mesh: Mesh | None
+    states: TrainState, values: dict[str, Any], step: int, growths: int, *, config: StaticConfig, mesh: Mesh | None
 ) -> TrainState:
     """`densify` for every member that has come to that step, all moving up the ladder when one runs out of rows."""
     while True:
-        grown, rows = _densify_all(states, values, step, config=config, mesh=mesh)
+        grown, rows = _densify_all(states, values, step, growths, config=config, mesh=mesh)
         if not rows:
             return grown
         states = _with_capacity(states, next_capacity(int(rows)))
@@ -195,29 +197,36 @@ def densify_all(
 
 @partial(jax.jit, static_argnames=("config", "mesh"))
 def _densify_all(
-    states: TrainState, values: dict[str, Any], step: Int[Array, ""] | int, *, config: StaticConfig, mesh: Mesh | None
+    states: TrainState,
+    values: dict[str, Any],
+    step: Int[Array, ""] | int,
+    growths: Int[Array, ""] | int,
+    *,
+    config: StaticConfig,
+    mesh: Mesh | None,
 ) -> tuple[TrainState, Int[Array, ""]]:
     def grow(
-        step: Int[Array, ""] | int, state: TrainState, values: dict[str, Any]
+        now: tuple[Int[Array, ""] | int, Int[Array, ""] | int], state: TrainState, values: dict[str, Any]
     ) -> tuple[TrainState, Int[Array, ""]]:
-        grown, rows = densify(state, combine(config, values))
+        step, growths = now
+        grown, rows = densify(state, combine(config, values), growths)
         due = state.step == step
         return tree_where(due, grown, state), jnp.where(due, rows, 0)
 
-    grown, rows = _each_member(grow, mesh, step, states, values)
+    grown, rows = _each_member(grow, mesh, (step, growths), states, values)
     return grown, rows.max()
 
 
 _with_capacity = partial(jax.jit, static_argnums=1)(jax.vmap(with_capacity, (0, None)))
 
 
-def _each_member(function: Callable, mesh: Mesh | None, step: Int[Array, ""] | int, *trees: PyTree) -> Any:
-    """`function(step, *rows)` of every row of the trees."""
+def _each_member(function: Callable, mesh: Mesh | None, common: PyTree, *trees: PyTree) -> Any:
+    """`function(common, *rows)` of every row of the trees."""
     platform = (mesh.devices.flat[0] if mesh else jax.devices()[0]).platform
 
-    def here(step: Int[Array, ""] | int, *trees: PyTree) -> Any:
+    def here(common: PyTree, *trees: PyTree) -> Any:
         """Of the rows that this device has."""
-        each = partial(function, step)
+        each = partial(function, common)
         if len(jax.tree.leaves(trees)[0]) == 1:
             return jax.tree.map(lambda x: x[None], each(*jax.tree.map(lambda x: x.squeeze(0), trees)))
         if platform == "cpu":
@@ -226,9 +235,9 @@ def _each_member(function: Callable, mesh: Mesh | None, step: Int[Array, ""] | i
         return jax.vmap(each)(*trees)
 
     if mesh is None:
-        return here(step, *trees)
+        return here(common, *trees)
     specs = (P(), P(MEMBERS), P(MEMBERS), P(MEMBERS, VIEWS))[: 1 + len(trees)]
-    return jax.shard_map(here, mesh=mesh, in_specs=specs, out_specs=P(MEMBERS), check_vma=False)(step, *trees)
+    return jax.shard_map(here, mesh=mesh, in_specs=specs, out_specs=P(MEMBERS), check_vma=False)(common, *trees)
 
 
 def _stack(trees: Sequence[T]) -> T:
@@ -270,6 +279,11 @@ def load_batch(split: Split, indices: Int[np.ndarray, " V"]) -> Batch:
     """The views of `indices`."""
     valid = None if split.valid is None else split.valid[indices]
     return Batch(Camera(*(x[indices] for x in split.cameras)), split.images[indices], valid)
+
+
+def growths_left(stage_step: int, stage_steps: int, config: Config) -> int:
+    """How often the stage grows from its step of that number on, this one included."""
+    return (min(config.density.stop - 1, stage_steps) - stage_step) // config.density.interval + 1
 
 
 def density_due(stage_step: int, config: Config) -> bool:

@@ -13,6 +13,8 @@ from l2dgs_jax.model.tone import Darkening, darkening
 from l2dgs_jax.runtime.capacity import next_capacity
 from l2dgs_jax.training.step import TrainState, begin_stage
 
+GAUSSIANS_PER_PIXEL = 0.5  # of a frame
+
 
 def split_darkening(split: Split, config: Config) -> Darkening:
     """How the frames are darker than `config.loss.exposure_level`."""
@@ -21,6 +23,10 @@ def split_darkening(split: Split, config: Config) -> Darkening:
 
 def resolve(config: Config, split: Split) -> Config:
     """The settings with what they leave to the data filled in from the training frames."""
+    if config.density.max_gaussians == "auto":
+        height, width = split.images.shape[1:3]
+        most = round(GAUSSIANS_PER_PIXEL * height * width)
+        config = dataclasses.replace(config, density=dataclasses.replace(config.density, max_gaussians=most))
     model = config.model
     if "auto" not in (*(model.initial_exponents or ()), model.initial_illumination):
         return config
@@ -38,7 +44,9 @@ def initial_state(dataset: Dataset, config: Config) -> TrainState:
     order, train = z_order(dataset.points), dataset.train
     points, colors = dataset.points[order], None if dataset.colors is None else dataset.colors[order]
     capacity = len(points)
-    if config.density.start < config.density.stop:
+    if config.density.method == "mcmc":
+        capacity = max(int(config.density.max_gaussians), capacity)
+    elif config.density.start < config.density.stop:
         capacity = next_capacity(min(1.5 * capacity, max(int(config.density.max_gaussians), capacity)))
     reflectance = None
     if config.model.reflectance_init == "observed":

@@ -19,6 +19,7 @@ GAUSSIAN_GROUPS: dict[str, Any] = {
     "illumination_rest": "illumination_rest",
     "reflectance": "reflectance",
     "attenuation": "attenuation",
+    "gate": "gate",
 }
 
 
@@ -26,7 +27,9 @@ def groups(params: SceneParams) -> SceneParams:
     """The learning-rate group of every leaf of `params`, by name (see `schedules`)."""
     label = lambda name, tree: jax.tree.map(lambda _: name, tree)
     return params._replace(
-        gaussians=Gaussians(**GAUSSIAN_GROUPS),
+        gaussians=Gaussians(
+            *(None if rows is None else GAUSSIAN_GROUPS[name] for name, rows in params.gaussians._asdict().items())
+        ),
         hexplane=label("planes", params.hexplane),
         heads=label("heads", params.heads),
         ocd=label("ocd", params.ocd),
@@ -55,6 +58,7 @@ def schedules(cfg: OptimConfig, extent: Float[Array, ""], stage_steps: int) -> d
         "opacities": (cfg.opacity_lr, cfg.opacity_lr),
         "scales": (cfg.scales_lr, cfg.scales_lr),
         "quats": (cfg.quats_lr, cfg.quats_lr),
+        "gate": (cfg.gate_lr, cfg.gate_lr),
     }
     steps = jnp.maximum(stage_steps if cfg.decay_steps is None else cfg.decay_steps, 1)
     factor = lambda name: extent if name in cfg.extent_scales else jnp.ones_like(extent)

@@ -6,16 +6,17 @@ from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from l2dgs_jax.config import Config
 from l2dgs_jax.model import hexplane
+from l2dgs_jax.model.deformation import length_unit
 from l2dgs_jax.model.initialisation import pad_rows
 from l2dgs_jax.model.rendering import render
-from l2dgs_jax.training import densification, losses, optimizer
+from l2dgs_jax.training import densification, losses, optimizer, relocation
 from l2dgs_jax.training.densification import GrowthStats
 from l2dgs_jax.training.parameter_groups import groups, schedules
-from l2dgs_jax.types import Camera, Scene, SceneParams
+from l2dgs_jax.types import Camera, Gaussians, Scene, SceneParams
 
 T = TypeVar("T")
 
@@ -59,7 +60,8 @@ class StepReport(NamedTuple):
 
 def sh_degree(step: Int[Array, ""] | int, config: Config) -> Int[Array, ""] | int:
     """SH bands in use after `step` steps: one more every `config.sh_warmup`."""
-    return jnp.minimum(step // max(config.sh_warmup, 1), config.model.sh_degree)
+    warmup = config.steps // (2 * max(config.model.sh_degree, 1)) if config.sh_warmup is None else config.sh_warmup
+    return jnp.minimum(step // max(warmup, 1), config.model.sh_degree)
 
 
 def exponent_target(config: Config) -> float | Float[Array, ""]:
@@ -112,14 +114,26 @@ def objective(
     start, steps = (config.coarse_steps, config.fine_steps) if moving else (0, config.coarse_steps)
     eta = losses.eta(state.step - start, steps, cfg) if cfg.eta_restarts else losses.eta(state.step, config.steps, cfg)
     target, counted = targets(batch, output.images.lowlight)
-    loss, terms = losses.total(output, target, cfg, eta, exponent_target(config))
+    measured = output._replace(depth=output.depth / length_unit(state.scene, config.model))
+    loss, terms = losses.total(measured, target, cfg, eta, exponent_target(config))
+    gaussians, alive = params.gaussians, state.scene.alive
     if moving:
+        if gaussians.gate is not None:
+            loss += cfg.gate * mean_alive(jax.nn.sigmoid(gaussians.gate), alive)
         smoothness, time_smoothness, time_l1 = hexplane.regularisers(params.hexplane)
         loss += cfg.plane_smoothness * smoothness + cfg.time_smoothness * time_smoothness + cfg.time_l1 * time_l1
+    scales = jnp.exp(jnp.where(alive[:, None], gaussians.log_scales, 0)).mean(-1)  # garbage in a dead row stays there
+    loss += cfg.opacity * mean_alive(jax.nn.sigmoid(gaussians.logit_opacities), alive)
+    loss += cfg.scale * mean_alive(scales, alive) / length_unit(state.scene, config.model)
     squares = jnp.mean(jnp.square(jax.lax.stop_gradient(output.images.lowlight) - target))
     mse = _mean(squares, axis) / _mean(counted, axis)
     report = StepReport(loss, terms, -10 * jnp.log10(mse), output.pairs, output.overflow, jnp.isfinite(loss))
     return loss, (report, output.radii)
+
+
+def mean_alive(values: Float[Array, " N"], alive: Bool[Array, " N"]) -> Float[Array, ""]:
+    """Mean of values of the Gaussians that are alive; it carries gradients."""
+    return jnp.where(alive, values, 0).sum() / jnp.maximum(alive.sum(), 1).astype(values.dtype)
 
 
 def targets(
@@ -172,6 +186,8 @@ def train_step(
         value_and_grad, transformation, state.scene.params, state.adam
     )
 
+    if config.density.method == "mcmc":
+        params = params._replace(gaussians=_disturbed(params.gaussians, state, config))
     height, width = batch.images.shape[1:3]
     report = report._replace(
         terms=_mean(report.terms, axis),
@@ -189,6 +205,19 @@ def train_step(
     if at is not None:
         taken &= state.step == at
     return tree_where(taken, stepped, state), report
+
+
+def _disturbed(gaussians: Gaussians, state: TrainState, config: Config) -> Gaussians:
+    """The Gaussians after the noise of this step, which fades with the learning rate of the centres."""
+    scene, cfg = state.scene, config.density
+    rate = optimizer.learning_rate(state.adam.schedules["means"], state.adam.step + 1)
+    size = cfg.noise * rate / jnp.where(scene.extent > 0, scene.extent, 1) ** 2
+    return relocation.disturb(gaussians, scene.alive, size, _key(state, config, 1), cfg.prune_opacity)
+
+
+def _key(state: TrainState, config: Config, purpose: int) -> PRNGKeyArray:
+    """Randomness of this step for one purpose."""
+    return jax.random.fold_in(jax.random.fold_in(jax.random.key(config.seed), state.step), purpose)
 
 
 def adam(params: SceneParams, rates: dict[str, optimizer.Schedule], config: Config) -> optimizer.Transformation:
@@ -210,11 +239,22 @@ def begin_stage(scene: Scene, step: Int[Array, ""], config: Config, stage_steps:
     return TrainState(scene, transformation.init(scene.params), densification.empty_stats(scene.alive.shape[0]), step)
 
 
-def densify(state: TrainState, config: Config) -> tuple[TrainState, Int[Array, ""]]:
-    """Clone, split and prune; also the number of rows that this needs, to be called again with if there are fewer."""
-    scene = state.scene
-    key = jax.random.fold_in(jax.random.key(config.seed), state.step)
-    result = densification.densify(scene.params.gaussians, scene.alive, state.stats, scene.extent, key, config.density)
+def densify(state: TrainState, config: Config, growths_left: Int[Array, ""] | int) -> tuple[TrainState, Int[Array, ""]]:
+    """Change the number of Gaussians; also how many rows that needs, to be called again with if there are fewer.
+
+    Args:
+        state: after a step.
+        config: settings.
+        growths_left: how often the stage grows from now on, this time included.
+    """
+    scene, cfg = state.scene, config.density
+    if cfg.method == "mcmc":
+        count = relocation.population(scene.alive.sum(), densification.most_gaussians(cfg), growths_left)
+        key = _key(state, config, 0)
+        result = relocation.relocate(scene.params.gaussians, scene.alive, count, key, cfg.prune_opacity)
+    else:
+        key = jax.random.fold_in(jax.random.key(config.seed), state.step)
+        result = densification.densify(scene.params.gaussians, scene.alive, state.stats, scene.extent, key, cfg)
 
     def forget(rows: Float[Array, "..."]) -> Float[Array, "..."]:
         return jnp.where(result.changed.reshape(-1, *[1] * (rows.ndim - 1)), 0, rows)

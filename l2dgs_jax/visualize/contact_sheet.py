@@ -35,7 +35,7 @@ def contact_sheet(run: Run, rows: int = 4) -> UInt8[np.ndarray, "H W 3"]:
     coloured = {"B1": exponents[..., 0], "B2": exponents[..., 1], "depth": depths}
     ranges = {name: np.percentile(values, (2, 98)) for name, values in coloured.items()}
     columns = [name for name in COLUMNS if name != "truth" or split.welllit is not None]
-    headings = [f"{name} {ranges[name][0]:.4g}-{ranges[name][1]:.4g}" if name in ranges else name for name in columns]
+    headings = [f"{name} {ranges[name][0]:.5g}-{ranges[name][1]:.5g}" if name in ranges else name for name in columns]
 
     lines = []
     kind = "held out" if held_out else "trained on"

@@ -2,10 +2,11 @@
 
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from jax.test_util import check_grads
 from scipy.spatial.transform import Rotation
 
-from l2dgs_jax.cameras import camera_centres, camera_extent, resize, select_camera
+from l2dgs_jax.cameras import camera_centres, camera_extent, median_depth, resize, select_camera
 from l2dgs_jax.types import Camera
 
 
@@ -44,3 +45,12 @@ def test_a_resized_camera_sees_the_same():
     batch = resize(cameras(CENTRES), 0.5).K
     np.testing.assert_allclose(batch[:, 1, 1], 7.5)
     np.testing.assert_allclose(batch[:, 2], [[0, 0, 1]] * 5)
+
+
+def test_the_median_depth_is_that_of_the_points_in_front():
+    viewmats = np.tile(np.eye(4), (3, 1, 1))
+    viewmats[:, 2, 3] = [0, 1, -3.5]
+    points = np.array([[5.0, 0, 1], [0, 5, 2], [0, 0, 3], [0, 1, 4]])
+    assert median_depth(Camera(viewmats, np.zeros((3, 3, 3)), np.zeros(3)), points) == 2.5
+    with pytest.raises(ValueError, match="in front"):
+        median_depth(Camera(viewmats, np.zeros((3, 3, 3)), np.zeros(3)), points - [0, 0, 100])

@@ -17,13 +17,13 @@ from l2dgs_jax import runs, train
 from l2dgs_jax.config import PRESETS
 from l2dgs_jax.data import load_dataset
 from l2dgs_jax.errors import UserError
-from l2dgs_jax.runs import checkpoints
+from l2dgs_jax.runs import checkpoints, open_run
 from l2dgs_jax.runtime import command_line, devices
 from l2dgs_jax.training import engine
 
 TINY = [
-    "--coarse-steps=6",
-    "--fine-steps=6",
+    "--coarse-steps=5",
+    "--fine-steps=7",
     "--checkpoint-every=2",
     "--model.plane-size=4",
     "--model.plane-scales=1",
@@ -72,7 +72,7 @@ def test_a_run_leaves_what_it_promises(finished):
     assert np.isfinite([metrics[-1]["loss"], metrics[-1]["psnr"]]).all()
     assert cv2.imread(str(folder / runs.CONTACT_SHEET)).std() > 1
     assert cv2.VideoCapture(str(folder / runs.VIDEO)).get(cv2.CAP_PROP_FRAME_COUNT) > 24
-    assert (folder / runs.COARSE).exists()
+    assert int(open_run(folder, "coarse").state.step) == 5
     assert not list(folder.glob("*.tmp*"))
     assert "12/12" in done.stderr
     assert "low-light" in done.stderr
@@ -156,6 +156,9 @@ def test_unknown_preset(refuses, scene, tmp_path):
 
 
 def test_no_steps(refuses, scene, tmp_path):
+    for option in ("--batch-size=0", "--batch-size=-1", "--checkpoint-every=0"):
+        refuses(scene, option, "--output", tmp_path / "run", naming=[option.split("=")[0], "at least 1"])
+        assert not (tmp_path / "run").exists()
     refuses(scene, "--coarse-steps=0", "--fine-steps=0", "--output", tmp_path / "run", naming=["--coarse-steps"])
 
 

@@ -148,31 +148,6 @@ def test_summary_is_the_mean_over_frames():
     assert json.loads(json.dumps(summary)) == summary
 
 
-@pytest.mark.parametrize("region", REGIONS)
-def test_gain_is_the_least_squares_factor_of_the_whole_split(region):
-    split = list(frames())
-    predictions, truths = (np.concatenate([f[i][REGIONS[region](f[2])].ravel() for f in split]) for i in (0, 1))
-    expected = np.linalg.lstsq(predictions[:, None], truths, rcond=None)[0].item()
-    scores = [metrics.compare(*frame)[region] for frame in split]
-    np.testing.assert_allclose(metrics.gain(scores), expected, rtol=1e-12)
-
-
-def test_psnr_after_the_gain_does_not_see_a_scaled_prediction():
-    split = list(frames())
-    psnrs = []
-    for factor in (1.0, 0.1):
-        plain = [metrics.compare(factor * p, t)["overall"] for p, t, _ in split]
-        g = metrics.gain(plain)
-        psnrs.append([metrics.compare(g * factor * p, t)["overall"].psnr for p, t, _ in split])
-    np.testing.assert_allclose(psnrs[0], psnrs[1], rtol=1e-12)
-    assert max(score.psnr for score in plain) < min(psnrs[0]) - 3
-
-
-def test_black_predictions_have_gain_one():
-    black = np.zeros((12, 12, 3))
-    assert metrics.gain([metrics.compare(black, black + 0.5)["overall"]]) == 1
-
-
 def test_regions_without_pixels_are_left_out():
     prediction, truth, mask = next(frames())
     nothing_moves = metrics.compare(prediction, truth, np.zeros_like(mask))

@@ -12,7 +12,7 @@ from jax.test_util import check_grads
 from l2dgs_jax.config import ModelConfig
 from l2dgs_jax.model import hexplane, networks
 from l2dgs_jax.model.deformation import deform
-from l2dgs_jax.types import Camera, Gaussians, SceneParams
+from l2dgs_jax.types import Camera, Gaussians, Scene, SceneParams
 
 CFG = ModelConfig(
     plane_size=3, plane_scales=(1, 2), plane_channels=2, time_size=3, hidden=5, sh_degree=2, opacity_head=True
@@ -20,7 +20,10 @@ CFG = ModelConfig(
 BOUNDS = jnp.asarray(np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))
 N = 6
 
-run = jax.jit(deform, static_argnames=("cfg", "moving"))
+
+@partial(jax.jit, static_argnames=("cfg", "moving"))
+def run(params, cameras, alive, bounds, cfg, extent=1.0, **options):
+    return deform(Scene(params, alive, bounds, jnp.asarray(extent)), cameras, cfg, **options)
 
 
 @partial(jax.jit, static_argnums=2)
@@ -183,10 +186,39 @@ def test_dead_rows_are_invisible_and_get_no_gradient_even_when_they_hold_garbage
     opacities = np.asarray(moved.opacities)
     np.testing.assert_array_equal(opacities[:, dead], 0)
     assert np.all(opacities[:, ~dead] > 0)
-    for leaf in gradient.gaussians:
+    for leaf in jax.tree.leaves(gradient.gaussians):
         np.testing.assert_array_equal(np.asarray(leaf)[dead], 0)
         assert np.any(np.asarray(leaf)[~dead] != 0)
     jax.tree.map(np.testing.assert_array_equal, gradient, expected)
+
+
+def gated(params, logits):
+    return params._replace(gaussians=params.gaussians._replace(gate=jnp.asarray(np.broadcast_to(logits, N))))
+
+
+def test_the_gate_lets_as_much_of_the_motion_through_as_it_says():
+    params, cameras = scene(), look()
+    free, still = (moved_at(params, cameras=cameras, moving=moving) for moving in (True, False))
+    logits = np.array([40.0, -40.0, 0.0, 40.0, -40.0, 0.0])
+    moved = moved_at(gated(params, logits), cameras=cameras, moving=True)
+    for name in ("means", "quats"):
+        ends = [np.asarray(getattr(x, name)) for x in (still, free)]
+        share = np.array([1, 0, 0.5, 1, 0, 0.5])[None, :, None]
+        np.testing.assert_allclose(getattr(moved, name), (1 - share) * ends[0] + share * ends[1], atol=1e-12)
+    for name in moved._fields:
+        for open_or_shut, whole in ((0, free), (1, still), (3, free), (4, still)):
+            value, expected = (getattr(x, name)[:, open_or_shut] for x in (moved, whole))
+            np.testing.assert_allclose(value, expected, atol=1e-12, err_msg=name)
+
+
+def test_motion_is_measured_in_the_unit_of_lengths():
+    params, cameras = scene(), look()
+    offset = lambda cfg, extent: (
+        moved_at(params, cameras=cameras, cfg=cfg, extent=extent, moving=True).means - params.gaussians.means[None]
+    )
+    by_depth = dataclasses.replace(CFG, unit="depth")
+    np.testing.assert_allclose(offset(by_depth, 3.0), 3 * offset(CFG, 3.0), rtol=1e-9)
+    np.testing.assert_array_equal(offset(CFG, 3.0), offset(CFG, 1.0))
 
 
 @pytest.mark.parametrize("moving", [False, True])

@@ -1,6 +1,7 @@
 """HexPlane against a plain bilinear lookup, its gradients, its borders and its penalties."""
 
 import dataclasses
+import itertools
 
 import jax
 import jax.numpy as jnp
@@ -175,3 +176,26 @@ def test_regularisers_of_a_ramp_and_of_two_instants_are_zero():
     ramp = lambda size: jnp.broadcast_to(jnp.arange(float(size))[None, :, None, None], (3, size, 4, 2))
     np.testing.assert_array_equal(hexplane.regularisers(HexPlane((ramp(4),), (ramp(6),)))[:2], 0)
     np.testing.assert_array_equal(hexplane.regularisers(HexPlane((ramp(4),), (ramp(2),)))[1], 0)
+
+
+def test_with_a_rim_all_of_space_has_cells_of_its_own():
+    cfg = dataclasses.replace(CFG, box_rim=0.25)
+    low, high = BOUNDS
+    ramp = np.linspace(0, 1, 801)[:, None]
+    inside = low + ramp * (high - low)
+    planes = random_planes()
+    find = lambda points: hexplane.features(planes, jnp.asarray(points), jnp.asarray(BOUNDS), jnp.asarray(TIMES), cfg)
+    middle = 0.5 * (low + high)
+    shrunk = features(
+        planes, jnp.asarray(middle + 0.75 * (inside - middle)), jnp.asarray(BOUNDS), jnp.asarray(TIMES), CFG
+    )
+    np.testing.assert_allclose(find(inside), shrunk, rtol=1e-9)
+    rays = [middle + distance * (high - low) * np.array([[0.6, -0.7, 0.8]]) for distance in (0.5, 1, 2, 4, 1e3, 1e30)]
+    found = [np.asarray(find(point)) for point in rays]
+    assert all(np.abs(a - b).max() > 1e-6 for a, b in itertools.pairwise(found[:-1]))
+    assert all(np.isfinite(x).all() for x in found)
+    gradient = jax.grad(lambda point: find(point).sum())(jnp.asarray(rays[3]))
+    assert np.all(gradient != 0)
+    step = 1e-6 * (high - low)
+    edge = [np.asarray(find((high + k * step)[None])) for k in (-1, 0, 1)]
+    np.testing.assert_allclose(edge[2] - edge[1], edge[1] - edge[0], rtol=1e-2, atol=1e-12)

@@ -40,7 +40,7 @@ def test_one_gaussian_a_point_and_dead_rows_after_them():
     np.testing.assert_allclose(gaussians.means[:20], POINTS)
     np.testing.assert_allclose(jax.nn.sigmoid(gaussians.logit_opacities[:20]), 0.1)
     np.testing.assert_array_equal(gaussians.quats[:20], np.tile([1, 0, 0, 0], (20, 1)))
-    for rows in gaussians:
+    for rows in jax.tree.leaves(gaussians):
         np.testing.assert_array_equal(rows[20:], 0)
     np.testing.assert_allclose(start.bounds, [POINTS.min(0), POINTS.max(0)])
     np.testing.assert_allclose(start.extent, 1.1)
@@ -153,3 +153,16 @@ def test_the_z_order_keeps_neighbours_together():
         cubes = ordered.reshape(-1, size**3, 3)
         np.testing.assert_array_equal(np.ptp(cubes, axis=1), size - 1)
     np.testing.assert_array_equal(initialisation.z_order(np.ones((3, 3))), np.arange(3))
+
+
+def test_the_box_leaves_out_as_many_points_as_it_should():
+    points = np.random.default_rng(2).normal([0, 0, 9], 1, (31, 3)).astype(np.float32)
+    points[7] = [500, -300, 90]
+    bounds = initialise(dataclasses.replace(CFG, box_points=0.9), points=points).bounds
+    np.testing.assert_allclose(bounds, np.quantile(points, [0.05, 0.95], axis=0), rtol=1e-6)
+    assert float(np.ptp(bounds, axis=0).max()) < 10
+
+
+def test_measured_by_depth_the_extent_is_a_part_of_it():
+    start = initialise(dataclasses.replace(CFG, unit="depth"))
+    np.testing.assert_allclose(start.extent, 0.25 * np.median(POINTS[:, 2]), rtol=1e-6)

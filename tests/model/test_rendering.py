@@ -1,9 +1,11 @@
+import dataclasses
+
 import finished_run
 import numpy as np
 import pytest
 
 from l2dgs_jax.cameras.geometry import select_camera
-from l2dgs_jax.model.rendering import expected_depth
+from l2dgs_jax.model.rendering import Renderer, expected_depth
 from l2dgs_jax.types import RenderOutput
 
 
@@ -25,3 +27,16 @@ def test_expected_depth_divides_by_alpha_and_is_zero_where_nothing_is():
     zero = np.zeros(())
     output = RenderOutput(None, np.array([[0.5, 0.0]]), np.array([[1.5, 0.0]]), zero, zero, zero)
     np.testing.assert_array_equal(expected_depth(output), [[3.0, 0.0]])
+
+
+@pytest.mark.parametrize("background", [0.0, 0.7])
+def test_the_background_is_seen_in_illumination_and_reflectance_where_nothing_is_drawn(base, background):
+    run = finished_run.opened(base)
+    empty = run.state.scene._replace(alive=np.zeros_like(run.state.scene.alive))
+    cfg = dataclasses.replace(run.config.model, background=background)
+    width, height = run.dataset.width, run.dataset.height
+    renderer = Renderer(empty, cfg, width, height, moving=True, sh_degree=1)
+    images = renderer(select_camera(run.dataset.test.cameras, 0)).images
+    np.testing.assert_allclose(images.illumination, np.full((height, width), background), rtol=1e-6)
+    np.testing.assert_allclose(images.reflectance, np.full((height, width, 3), background), rtol=1e-6)
+    np.testing.assert_allclose(images.welllit, np.full((height, width, 3), background**2), rtol=1e-6)

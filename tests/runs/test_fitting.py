@@ -76,7 +76,9 @@ def test_views_of_any_size_and_instant(dataset, quick):
     camera = dataset.test.camera(2)
     view = run.render(camera)
     assert view.images.welllit.shape == (dataset.height, dataset.width, 3)
-    wide = run.render(camera, width=dataset.width + 8)
+    wide = run.render(camera, dataset.width + 8, dataset.height)
+    with pytest.raises(ValueError, match="both numbers, or neither"):
+        run.render(camera, width=dataset.width + 8)
     assert wide.alpha.shape == (dataset.height, dataset.width + 8)
     assert np.abs(wide.alpha[:, : dataset.width] - view.alpha).mean() < 0.02
     assert run.renderer() is run.renderer(dataset.width, dataset.height)

@@ -1,6 +1,7 @@
 """Every schedule reaches the step that it is meant for: the numbers of a whole run, not only the formulas."""
 
 import dataclasses
+from functools import partial
 from types import SimpleNamespace
 
 import jax
@@ -111,7 +112,7 @@ def test_the_planes_are_smoothed_in_the_fine_stage_only(dataset):
 @pytest.fixture
 def journal(monkeypatch):
     """What `engine.run` does at which step, without any training."""
-    entries = SimpleNamespace(steps=[], stages=[], growths=[])
+    entries = SimpleNamespace(steps=[], stages=[], growths=[], growths_left=[])
 
     def take(states, batches, values, number, *, config, moving, pair_capacity, mesh):
         entries.steps.append((number, moving, np.asarray(batches.cameras.time)[0].tolist()))
@@ -124,8 +125,9 @@ def journal(monkeypatch):
         entries.stages.append(number)
         return begin(states, values, number, **options)
 
-    def densify_all(states, values, number, **_):
+    def densify_all(states, values, number, left, **_):
         entries.growths.append(number)
+        entries.growths_left.append(left)
         return states
 
     monkeypatch.setattr(engine, "train_steps", take)
@@ -150,6 +152,7 @@ def test_stages_views_and_growth_of_a_run(dataset, journal):
         np.testing.assert_array_equal(shown, times[view_indices(5, number, config.batch_size, len(times))])
     assert journal.stages == [COARSE]
     assert journal.growths == [3, 6, COARSE + 3, COARSE + 6]  # counted from the start of each stage
+    assert journal.growths_left == [2, 1, 2, 1]
     assert states[COARSE + FINE].step == COARSE + FINE
 
 
@@ -202,3 +205,38 @@ def test_every_rate_moves_its_parameters_and_no_others(dataset):
         after = take(state._replace(adam=state.adam._replace(schedules=rates))).scene.params
         moved = {label for label, x, y in zip(labels, leaves, jax.tree.leaves(after), strict=True) if np.any(x != y)}
         assert moved == {name}
+
+
+def test_weights_on_sizes_and_the_gate(dataset):
+    """Each counts in the stages and in the unit that it should."""
+    config = config_of()
+    model = dataclasses.replace(config.model, motion_gate=True, unit="depth")
+    bare = dataclasses.replace(config, model=model)
+    state = initial_state(dataset, bare)
+    gaussians = state.scene.params.gaussians
+    alive = np.asarray(state.scene.alive)
+    mean = lambda values: float(np.asarray(values)[alive].mean())
+    sizes = {
+        "opacity": mean(jax.nn.sigmoid(gaussians.logit_opacities)),
+        "scale": mean(jnp.exp(gaussians.log_scales).mean(-1)) / float(state.scene.extent),
+        "gate": mean(jax.nn.sigmoid(gaussians.gate)),
+    }
+    batch, probe = batch_of(dataset), jnp.zeros((2, len(state.scene.alive), 2))
+
+    @partial(jax.jit, static_argnums=1)
+    def loss(weights, moving):
+        config = overrides.replace(bare, {f"loss.{name}": weight for name, weight in weights.items()})
+        return step.objective(state.scene.params, probe, state, batch, config, moving, 4096)[0]
+
+    for moving in (False, True):
+        plain = loss(dict.fromkeys(sizes, 0.0), moving)
+        for name, size in sizes.items():
+            expected = 0 if name == "gate" and not moving else 2 * size
+            added = loss(dict.fromkeys(sizes, 0.0) | {name: 2.0}, moving) - plain
+            np.testing.assert_allclose(added, expected, rtol=1e-6, atol=1e-12, err_msg=name)
+
+
+def test_bands_by_the_length_of_the_run(dataset):
+    config = dataclasses.replace(config_of(), coarse_steps=40, fine_steps=80, sh_warmup=None)
+    config = dataclasses.replace(config, model=dataclasses.replace(config.model, sh_degree=3))
+    assert [int(step.sh_degree(number, config)) for number in (0, 19, 20, 40, 59, 60, 119)] == [0, 0, 1, 2, 2, 3, 3]

@@ -1,7 +1,11 @@
 """Contact sheet, video, and the files they are written to."""
 
+import dataclasses
+
 import cv2
 import finished_run
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -16,7 +20,13 @@ from l2dgs_jax.visualize.video import VIDEO_RATE, VIDEO_SECONDS, write_run_video
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    return finished_run.opened(tmp_path_factory.getbasetemp())
+    """A finished run whose exponents differ from pixel to pixel."""
+    run = finished_run.opened(tmp_path_factory.getbasetemp())
+    rng = np.random.default_rng(0)
+    shake = lambda x: x + jnp.asarray(rng.normal(0, 0.5, x.shape), x.dtype)
+    params = run.state.scene.params
+    params = params._replace(bafe=jax.tree.map(shake, params.bafe))
+    return dataclasses.replace(run, state=run.state._replace(scene=run.state.scene._replace(params=params)))
 
 
 def test_contact_sheet_shows_every_part_of_the_render(run):
@@ -49,6 +59,9 @@ def test_contact_sheet_shows_every_part_of_the_render(run):
         np.testing.assert_array_equal(cell(row, "well-lit"), expected(images.welllit))
         np.testing.assert_array_equal(cell(row, "re-lit low light"), expected(images.lowlight))
         np.testing.assert_array_equal(cell(row, "R"), expected(images.reflectance))
+        for column, values in (("B1", images.attenuation[..., 0]), ("B2", images.attenuation[..., 1])):
+            # Brighter in the picture where it is larger: viridis gains green with every step.
+            assert np.corrcoef(cell(row, column)[..., 1].ravel(), np.asarray(values).ravel())[0, 1] > 0.9
         np.testing.assert_array_equal(cell(row, "L")[..., 1], expected(images.illumination))
         assert np.ptp(cell(row, "depth"), axis=(0, 1)).max() > 50
     for heading in range(len(COLUMNS)):

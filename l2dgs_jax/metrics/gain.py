@@ -1,0 +1,37 @@
+"""The factor that an image's brightness is off by."""
+
+from collections.abc import Iterable
+
+import numpy as np
+from jaxtyping import Float
+
+LEVELS = 2**14  # of a prediction, which decide where it saturates
+
+
+def best_gain(frames: Iterable[tuple[Float[np.ndarray, "..."], Float[np.ndarray, "..."]]]) -> float:
+    """The one factor g >= 0 that minimises the mean of (min(g p, 1) - t)^2; 1 if every prediction is 0.
+
+    Saturated values stop to count against a larger factor, as they do to the eye. Between the factors at which one more
+    value saturates the error is a parabola, so its least value is found exactly, but for values rounded to `LEVELS`.
+
+    Args:
+        frames: predictions p and truths t, in [0, 1].
+    """
+    square, product, beyond = np.zeros((3, LEVELS))  # sums of p^2, p t and 1 - 2 t, over the values of a level
+    for prediction, truth in frames:
+        p, t = (np.asarray(x, np.float64).ravel() for x in (prediction, truth))
+        level = np.minimum((p * LEVELS).astype(int), LEVELS - 1)
+        square += np.bincount(level, p * p, LEVELS)
+        product += np.bincount(level, p * t, LEVELS)
+        beyond += np.bincount(level, 1 - 2 * t, LEVELS)
+    if not square.any():
+        return 1.0
+    # With levels up to the k-th below saturation, g lies between 1 / (its upper end) and that of the next.
+    below_square, below_product = np.cumsum(square), np.cumsum(product)
+    saturated = beyond.sum() - np.cumsum(beyond)
+    upper = LEVELS / np.arange(1, LEVELS + 1)
+    lower = np.append(upper[1:], 0.0)
+    free = np.divide(below_product, below_square, out=upper.copy(), where=below_square > 0)
+    gains = np.clip(free, lower, upper)
+    errors = gains**2 * below_square - 2 * gains * below_product + saturated
+    return float(gains[np.argmin(errors)])

@@ -1,0 +1,187 @@
+"""Relocation, births and noise: the image stays, the number is met, only faint Gaussians wander."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from tiny_training import make_dataset, tiny
+
+from l2dgs_jax.rasterizer import rasterize
+from l2dgs_jax.training import engine, initial_state
+from l2dgs_jax.training.relocation import disturb, population, relocate
+from l2dgs_jax.training.step import train_step
+from l2dgs_jax.types import Gaussians
+
+WIDTH, HEIGHT = 40, 32
+DEAD = 0.005
+
+
+def gaussians(opacities, key=0):
+    count = len(opacities)
+    rng = np.random.default_rng(key)
+    opacities = np.asarray(opacities)
+    return Gaussians(
+        means=jnp.asarray(rng.uniform([-1, -0.8, 2], [1, 0.8, 3], (count, 3))),
+        quats=jnp.asarray(rng.normal(size=(count, 4))),
+        log_scales=jnp.asarray(np.log(rng.uniform(0.05, 0.3, (count, 3)))),
+        logit_opacities=jnp.asarray(np.log(opacities / (1 - opacities))),
+        illumination_dc=jnp.asarray(rng.normal(size=(count, 1))),
+        illumination_rest=jnp.asarray(rng.normal(size=(count, 3))),
+        reflectance=jnp.asarray(rng.uniform(0, 1, (count, 3))),
+        attenuation=jnp.asarray(rng.normal(size=(count, 2))),
+    )
+
+
+def draw(rows, alive):
+    opacities = jnp.where(alive, jax.nn.sigmoid(rows.logit_opacities), 0)
+    K = jnp.array([[30.0, 0, WIDTH / 2], [0, 30.0, HEIGHT / 2], [0, 0, 1]])
+    geometry = (rows.means, rows.quats, jnp.exp(rows.log_scales), opacities)
+    return rasterize(*geometry, rows.reflectance, jnp.eye(4), K, WIDTH, HEIGHT)
+
+
+@pytest.mark.parametrize("count", [41, 60, 90])
+def test_births_leave_the_image_nearly_as_it_was(count):
+    rows = gaussians(np.tile(np.linspace(0.1, 0.95, 10), 9))
+    alive = jnp.arange(90) < 40
+    result = relocate(rows, alive, jnp.array(count), jax.random.key(1), DEAD)
+    assert result.alive.sum() == count
+    before, after = draw(rows, alive), draw(result.gaussians, result.alive)
+    assert float(before.alpha.mean()) > 0.3
+    assert float(jnp.abs(after.alpha - before.alpha).mean()) < 0.02
+    assert float(jnp.abs(after.features - before.features).mean()) < 0.02
+    naive = jax.tree.map(lambda x: x.at[40:count].set(x[: count - 40]), rows)
+    assert float(jnp.abs(draw(naive, result.alive).alpha - before.alpha).mean()) > 3 * float(
+        jnp.abs(after.alpha - before.alpha).mean()
+    )
+
+
+@pytest.mark.parametrize("copies", [1, 2, 5, 30])
+@pytest.mark.parametrize("opacity", [0.01, 0.3, 0.9, 0.999])
+def test_together_the_copies_cover_what_their_source_did(opacity, copies):
+    rows = gaussians([opacity] + [0.5] * copies)
+    result = relocate(rows, jnp.arange(copies + 1) < 1, jnp.array(copies + 1), jax.random.key(0), DEAD)
+    for before, after in zip(jax.tree.leaves(rows), jax.tree.leaves(result.gaussians), strict=True):
+        if before is not rows.logit_opacities and before is not rows.log_scales:
+            np.testing.assert_array_equal(after, np.broadcast_to(before[:1], after.shape))
+    new = jax.nn.sigmoid(result.gaussians.logit_opacities)
+    np.testing.assert_allclose(1 - np.prod(1 - new), opacity, rtol=1e-9)
+    shrunk = np.exp(result.gaussians.log_scales[:, 0] - rows.log_scales[0, 0])
+    x = np.linspace(-12, 12, 20001)
+    profile = 1 - np.prod([1 - o * np.exp(-0.5 * (x / s) ** 2) for o, s in zip(new, shrunk, strict=True)], axis=0)
+    np.testing.assert_allclose(profile.sum(), (opacity * np.exp(-0.5 * x**2)).sum(), rtol=1e-6)
+
+
+def test_the_dead_go_where_the_living_are_and_the_others_stay():
+    rows = gaussians([0.4, 0.001, 0.9, 0.002, 0.6])
+    alive = jnp.array([True, True, True, True, False])
+    result = relocate(rows, alive, jnp.array(4), jax.random.key(3), DEAD)
+    np.testing.assert_array_equal(result.alive, alive)
+    living = {tuple(np.asarray(rows.means[i])) for i in (0, 2)}
+    assert all(tuple(np.asarray(result.gaussians.means[i])) in living for i in (1, 3))
+    np.testing.assert_array_equal(result.changed[jnp.array([1, 3, 4])], [True, True, False])
+    for i in (0, 2, 4):
+        if not result.changed[i]:
+            for before, after in zip(jax.tree.leaves(rows), jax.tree.leaves(result.gaussians), strict=True):
+                np.testing.assert_array_equal(after[i], before[i])
+
+
+def test_sources_are_drawn_in_proportion_to_their_opacity():
+    opacities = np.array([0.1, 0.2, 0.4, 0.8])
+    rows = gaussians(np.append(opacities, np.full(4000, 0.5)))
+    result = relocate(rows, jnp.arange(4004) < 4, jnp.array(4004), jax.random.key(0), DEAD)
+    means = np.asarray(result.gaussians.means)
+    drawn = [np.all(means[4:] == mean[None], axis=1).mean() for mean in means[:4]]
+    np.testing.assert_allclose(drawn, opacities / opacities.sum(), atol=0.03)
+
+
+def test_where_nothing_lives_nothing_is_born():
+    rows = gaussians([0.001, 0.002, 0.5])
+    result = relocate(rows, jnp.array([True, True, False]), jnp.array(3), jax.random.key(0), DEAD)
+    assert not result.changed.any()
+    assert all(bool(jnp.isfinite(x).all()) for x in jax.tree.leaves(result.gaussians))
+
+
+def test_the_number_grows_by_equal_factors_and_ends_where_it_should():
+    numbers = [100]
+    for left in (4, 3, 2, 1):
+        numbers.append(int(population(jnp.array(numbers[-1]), 1600, left)))
+    np.testing.assert_allclose(numbers, [100, 200, 400, 800, 1600], atol=1)
+    assert int(population(jnp.array(1700), 1600, 3)) == 1700
+
+
+def test_only_faint_gaussians_wander_and_by_their_own_covariance():
+    count = 20_000
+    rows = gaussians(np.full(count, 1e-6))
+    rows = rows._replace(
+        quats=jnp.tile(rows.quats[:1], (count, 1)), log_scales=jnp.tile(rows.log_scales[:1], (count, 1))
+    )
+    alive = jnp.arange(count) < count - 5
+    moved = disturb(rows, alive, jnp.array(0.7), jax.random.key(0), DEAD)
+    for name, before, after in zip(rows._fields[:-1], rows[:-1], moved[:-1], strict=True):
+        np.testing.assert_array_equal(after[-5:], before[-5:])
+        if name != "means":
+            np.testing.assert_array_equal(after, before)
+    steps = np.asarray(moved.means - rows.means)[:-5]
+    w, x, y, z = rows.quats[0] / jnp.linalg.norm(rows.quats[0])
+    turn = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    covariance = turn @ np.diag(np.exp(2 * np.asarray(rows.log_scales[0]))) @ turn.T
+    gate = 1 / (1 + np.exp(-100 * DEAD))
+    expected = (0.7 * gate) ** 2 * covariance @ covariance
+    np.testing.assert_allclose(np.cov(steps.T), expected, atol=0.05 * expected.max())
+    solid = rows._replace(logit_opacities=jnp.full(count, 0.0))
+    still = disturb(solid, alive, jnp.array(0.7), jax.random.key(0), DEAD)
+    assert float(jnp.abs(still.means - rows.means).max()) < 1e-12
+
+
+def growing(**changes):
+    config = tiny(coarse_steps=8, fine_steps=0)
+    density = dataclasses.replace(
+        config.density, method="mcmc", start=0, stop=1000, interval=2, max_gaussians=64, **changes
+    )
+    return dataclasses.replace(config, density=density)
+
+
+def test_training_meets_the_number_and_compiles_once():
+    dataset, config = make_dataset(), growing()
+    state = initial_state(dataset, config)
+    assert len(state.scene.alive) == 64
+    engine._densify_all.clear_cache()
+    numbers = []
+    member = engine.Member(dataset.train, config, state)
+    for progress in engine.run([member]):
+        numbers.append(int(progress.states.scene.alive.sum()))
+    assert (numbers[0], numbers[-1]) == (25, 64)
+    assert numbers == sorted(numbers)
+    assert len(set(numbers)) == 5
+    assert engine._densify_all._cache_size() == 1
+
+
+def test_noise_is_wired_to_its_strength_and_fades_with_the_learning_rate():
+    dataset, config = make_dataset(), growing()
+    faint = dataclasses.replace(config, model=dataclasses.replace(config.model, initial_opacity=0.004))
+    state = initial_state(dataset, faint)
+    batch = jax.tree.map(lambda x: jnp.asarray(x, float), engine.load_batch(dataset.train, np.array([0, 3])))
+
+    @jax.jit
+    def centres(noise, schedule):
+        own = dataclasses.replace(faint, density=dataclasses.replace(faint.density, noise=noise))
+        schedules = state.adam.schedules | {"means": schedule}
+        begun = state._replace(adam=state.adam._replace(schedules=schedules))
+        return train_step(begun, batch, own, moving=False, pair_capacity=4096)[0].scene.params.gaussians.means
+
+    rate = state.adam.schedules["means"]
+    slow = rate._replace(start=rate.start / 4, end=rate.end / 4)
+    moved = lambda noise, schedule: np.abs(np.asarray(centres(noise, schedule) - centres(0.0, schedule)))
+    whole = moved(1e5, rate)
+    assert np.median(whole[:25]) > 1e-4
+    np.testing.assert_array_equal(whole[25:], 0)
+    np.testing.assert_allclose(moved(2e5, rate), 2 * whole, atol=1e-9)
+    np.testing.assert_allclose(moved(1e5, slow), whole / 4, atol=1e-9)
