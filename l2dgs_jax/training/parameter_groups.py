@@ -25,11 +25,13 @@ GAUSSIAN_GROUPS: dict[str, Any] = {
 
 def groups(params: SceneParams) -> SceneParams:
     """The learning-rate group of every leaf of `params`, by name (see `schedules`)."""
+    present: dict[str, Any] = params.gaussians._asdict()
+    gaussians: dict[str, Any] = {
+        name: rows if rows is None else GAUSSIAN_GROUPS[name] for name, rows in present.items()
+    }
     label = lambda name, tree: jax.tree.map(lambda _: name, tree)
     return params._replace(
-        gaussians=Gaussians(
-            *(None if rows is None else GAUSSIAN_GROUPS[name] for name, rows in params.gaussians._asdict().items())
-        ),
+        gaussians=Gaussians(**gaussians),
         hexplane=label("planes", params.hexplane),
         heads=label("heads", params.heads),
         ocd=label("ocd", params.ocd),

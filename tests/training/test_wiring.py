@@ -188,7 +188,7 @@ def test_the_optimizer_starts_anew_with_the_fine_stage_and_not_when_a_run_goes_o
 
 @pytest.mark.slow
 def test_every_rate_moves_its_parameters_and_no_others(dataset):
-    config = config_of()
+    config = config_of(**{"model.motion_gate": True})
     state, batch = initial_state(dataset, config), batch_of(dataset)
     leaves, treedef = jax.tree.flatten(state.scene.params)
     keys = jax.random.split(jax.random.key(0), len(leaves))
