@@ -15,6 +15,7 @@ from l2dgs_jax.model.decomposition import power
 from l2dgs_jax.types import RenderOutput
 
 Scalar = Float[Array, ""]
+Terms = dict[str, tuple[Scalar | float, Callable[[], Scalar]]]  # weight and value by name
 
 
 def total(
@@ -43,7 +44,7 @@ def total(
     exposed = images.reflectance if cfg.exposure_of == "reflectance" else images.welllit
     illumination = images.illumination[..., None]
     b1, b2 = images.attenuation[..., :1], images.attenuation[..., 1:]
-    terms: dict[str, tuple[Scalar | float, Callable[[], Scalar]]] = {
+    terms: Terms = {
         "l1": (1.0, lambda: photometric_l1(images.lowlight, target, cfg.l1_on, eta, cfg.eps)),
         "ssim": (cfg.ssim, lambda: photometric_ssim(images.lowlight, target, eta, cfg.eps)),
         "exposure": (
@@ -66,10 +67,16 @@ def total(
         "illumination_tv": (cfg.illumination_tv, lambda: total_variation(images.illumination)),
         "exponent_prior": (cfg.exponent_prior, lambda: exponent_prior(images.attenuation, exponent_target)),
     }
+    return weighted_sum(terms)
+
+
+def weighted_sum(terms: Terms) -> tuple[Scalar, dict[str, Scalar]]:
+    """The sum of weight * term, and each term by name; those of weight 0 are left out, unless that weight is traced."""
     values = {
         name: term() for name, (weight, term) in terms.items() if not (isinstance(weight, float | int) and weight == 0)
     }
-    return jnp.stack([terms[name][0] * value for name, value in values.items()]).sum(), values
+    weighted = [terms[name][0] * value for name, value in values.items()]
+    return jnp.stack(weighted).sum() if weighted else jnp.asarray(0.0), values
 
 
 def eta(step: Int[Array, ""] | int, steps: int, cfg: LossConfig) -> Scalar:

@@ -116,24 +116,37 @@ def objective(
     target, counted = targets(batch, output.images.lowlight)
     measured = output._replace(depth=output.depth / length_unit(state.scene, config.model))
     loss, terms = losses.total(measured, target, cfg, eta, exponent_target(config))
-    gaussians, alive = params.gaussians, state.scene.alive
     if moving:
-        if gaussians.gate is not None:
-            loss += cfg.gate * mean_alive(jax.nn.sigmoid(gaussians.gate), alive)
         smoothness, time_smoothness, time_l1 = hexplane.regularisers(params.hexplane)
         loss += cfg.plane_smoothness * smoothness + cfg.time_smoothness * time_smoothness + cfg.time_l1 * time_l1
-    scales = jnp.exp(jnp.where(alive[:, None], gaussians.log_scales, 0)).mean(-1)  # garbage in a dead row stays there
-    loss += cfg.opacity * mean_alive(jax.nn.sigmoid(gaussians.logit_opacities), alive)
-    loss += cfg.scale * mean_alive(scales, alive) / length_unit(state.scene, config.model)
+    size, sizes = losses.weighted_sum(size_terms(state.scene._replace(params=params), config, moving))
+    loss, terms = loss + size, terms | sizes
     squares = jnp.mean(jnp.square(jax.lax.stop_gradient(output.images.lowlight) - target))
     mse = _mean(squares, axis) / _mean(counted, axis)
     report = StepReport(loss, terms, -10 * jnp.log10(mse), output.pairs, output.overflow, jnp.isfinite(loss))
     return loss, (report, output.radii)
 
 
-def mean_alive(values: Float[Array, " N"], alive: Bool[Array, " N"]) -> Float[Array, ""]:
-    """Mean of values of the Gaussians that are alive; it carries gradients."""
-    return jnp.where(alive, values, 0).sum() / jnp.maximum(alive.sum(), 1).astype(values.dtype)
+def size_terms(scene: Scene, config: Config, moving: bool) -> losses.Terms:
+    """Weight and value of what keeps Gaussians few, small and still: means over those that are alive."""
+    gaussians, alive, cfg = scene.params.gaussians, scene.alive, config.loss
+
+    def mean(values: Float[Array, " N"]) -> Float[Array, ""]:
+        return jnp.where(alive, values, 0).sum() / jnp.maximum(alive.sum(), 1).astype(values.dtype)
+
+    def scale() -> Float[Array, ""]:
+        # Garbage in a dead row could overflow the exponential, and 0 * inf would be a gradient of NaN.
+        scales = jnp.exp(jnp.where(alive[:, None], gaussians.log_scales, 0))
+        return mean(scales.mean(-1)) / length_unit(scene, config.model)
+
+    terms: losses.Terms = {
+        "opacity": (cfg.opacity, lambda: mean(jax.nn.sigmoid(gaussians.logit_opacities))),
+        "scale": (cfg.scale, scale),
+    }
+    if moving and gaussians.gate is not None:
+        gate = gaussians.gate
+        terms["gate"] = (cfg.gate, lambda: mean(jax.nn.sigmoid(gate)))
+    return terms
 
 
 def targets(
