@@ -134,9 +134,12 @@ def test_a_small_pair_buffer_grows_for_all(members, alone):
 
 
 @pytest.mark.slow
-def test_every_setting_that_members_may_differ_in_can_be_traced(members):
+@pytest.mark.parametrize(
+    "forms", [{}, {"density.method": "mcmc", "model.motion_gate": True, "model.unit": "depth"}], ids=["plain", "mcmc"]
+)
+def test_every_setting_that_members_may_differ_in_can_be_traced(forms):
     """A step whose numbers are traced is the step whose numbers are compiled in."""
-    one = member(0, {"loss.amplification": 0.02, "optim.decay_steps": 7})
+    one = member(0, {"loss.amplification": 0.02, "loss.gate": 0.03, "optim.decay_steps": 7} | forms)
     config, batch = one.config, engine.load_batch(one.split, np.array([0, 3]))
     values = {
         name: jax.tree.map(jnp.asarray, value)
@@ -148,12 +151,12 @@ def test_every_setting_that_members_may_differ_in_can_be_traced(members):
     def traced(state, batch, values):
         own = overrides.replace(_all_changed(config), values)
         fresh = step.begin_stage(state.scene, state.step, own, 9)
-        return step.densify(step.train_step(fresh, batch, own, moving=True, pair_capacity=4096)[0], own)
+        return step.densify(step.train_step(fresh, batch, own, moving=True, pair_capacity=4096)[0], own, 2)
 
     @jax.jit
     def compiled_in(state, batch):
         fresh = step.begin_stage(state.scene, state.step, config, 9)
-        return step.densify(step.train_step(fresh, batch, config, moving=True, pair_capacity=4096)[0], config)
+        return step.densify(step.train_step(fresh, batch, config, moving=True, pair_capacity=4096)[0], config, 2)
 
     for x, y in zip(
         *map(jax.tree.leaves, (traced(one.state, batch, values), compiled_in(one.state, batch))), strict=True
