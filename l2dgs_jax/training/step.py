@@ -247,7 +247,8 @@ def begin_stage(scene: Scene, step: Int[Array, ""], config: Config, stage_steps:
         config: settings.
         stage_steps: length of the stage that begins.
     """
-    rates = schedules(config.optim, scene.extent, stage_steps)
+    used = set(jax.tree.leaves(groups(scene.params)))
+    rates = {name: rate for name, rate in schedules(config.optim, scene.extent, stage_steps).items() if name in used}
     transformation = adam(scene.params, rates, config)
     return TrainState(scene, transformation.init(scene.params), densification.empty_stats(scene.alive.shape[0]), step)
 

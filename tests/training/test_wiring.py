@@ -11,6 +11,7 @@ import pytest
 from tiny_training import make_dataset, tiny
 
 from l2dgs_jax.config import DensityConfig, overrides
+from l2dgs_jax.config.settings import RATE_GROUPS
 from l2dgs_jax.model import hexplane
 from l2dgs_jax.runtime import devices
 from l2dgs_jax.training import engine, initial_state, step
@@ -205,6 +206,12 @@ def test_every_rate_moves_its_parameters_and_no_others(dataset):
         after = take(state._replace(adam=state.adam._replace(schedules=rates))).scene.params
         moved = {label for label, x, y in zip(labels, leaves, jax.tree.leaves(after), strict=True) if np.any(x != y)}
         assert moved == {name}
+
+
+def test_a_scene_without_a_gate_has_no_rate_for_it(dataset):
+    """So that its checkpoints are those of versions before there was one."""
+    rates = initial_state(dataset, config_of()).adam.schedules
+    assert rates.keys() == set(RATE_GROUPS) - {"gate"}
 
 
 def test_weights_on_sizes_and_the_gate(dataset):
