@@ -51,7 +51,7 @@ def deform(
             gate = jax.nn.sigmoid(gaussians.gate)[None]
             motion = jax.tree.map(lambda change: gate.reshape(1, -1, *[1] * (change.ndim - 2)) * change, motion)
             factors = 1 + gate[..., None] * (factors - 1)
-        means += length_unit(scene, cfg) * motion.means
+        means += length_unit(scene.extent, cfg) * motion.means
         quats += motion.quats
         log_scales += motion.log_scales
         if motion.logit_opacities is not None:
@@ -68,9 +68,9 @@ def deform(
     )
 
 
-def length_unit(scene: Scene, cfg: ModelConfig) -> Float[Array, ""] | float:
-    """The length that the scene's motion, depths and scales are measured in, world units."""
-    return scene.extent if cfg.unit == "depth" else 1.0
+def length_unit(extent: Float[Array, ""] | float, cfg: ModelConfig) -> Float[Array, ""] | float:
+    """The length that motion, depths and scales of a scene of that extent are measured in, world units."""
+    return extent if cfg.unit == "depth" else 1.0
 
 
 def _active_coefficients(gaussians: Gaussians, degree: int, active: Int[Array, ""] | int) -> Float[Array, "1 N J"]:

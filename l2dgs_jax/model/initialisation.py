@@ -15,6 +15,7 @@ from l2dgs_jax.cameras.geometry import camera_extent, median_depth
 from l2dgs_jax.config import ModelConfig
 from l2dgs_jax.data.stacks import pixel_mean, stacked
 from l2dgs_jax.model import hexplane, networks
+from l2dgs_jax.model.deformation import length_unit
 from l2dgs_jax.runtime.prefetch import prefetch
 from l2dgs_jax.types import Camera, Gaussians, Scene, SceneParams
 
@@ -71,7 +72,7 @@ def initialise(
         illumination = np.full(count, 0.5) if colors is None else np.asarray(colors) @ LUMINANCE
     bias = None if cfg.initial_exponents is None else networks.exponent_bias(cfg.initial_exponents)
     extent = camera_extent(cameras) if cfg.unit == "world" else DEPTHS_PER_EXTENT * median_depth(cameras, points)
-    least = LEAST_SPACING * (extent if cfg.unit == "depth" else 1)
+    least = LEAST_SPACING * length_unit(extent, cfg)
     rim = (1 - cfg.box_points) / 2
     arrays: tuple = (
         points,

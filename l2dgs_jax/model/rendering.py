@@ -59,7 +59,7 @@ def render(
         cameras.K,
         width,
         height,
-        near_plane=NEAR_PLANE * length_unit(scene, cfg),
+        near_plane=NEAR_PLANE * length_unit(scene.extent, cfg),
         means2d_probe=means2d_probe,
         pair_capacity=pair_capacity,
     )

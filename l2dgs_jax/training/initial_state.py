@@ -5,7 +5,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 
-from l2dgs_jax.config import Config
+from l2dgs_jax.config import Config, overrides
 from l2dgs_jax.data.dataset import Dataset, Split
 from l2dgs_jax.model import networks
 from l2dgs_jax.model.initialisation import initialise, observed_colors, scene_shapes, z_order
@@ -26,7 +26,7 @@ def resolve(config: Config, split: Split) -> Config:
     if config.density.max_gaussians == "auto":
         height, width = split.images.shape[1:3]
         most = round(GAUSSIANS_PER_PIXEL * height * width)
-        config = dataclasses.replace(config, density=dataclasses.replace(config.density, max_gaussians=most))
+        config = overrides.replace(config, {"density.max_gaussians": most})
     model = config.model
     if "auto" not in (*(model.initial_exponents or ()), model.initial_illumination):
         return config

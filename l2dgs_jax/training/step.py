@@ -114,7 +114,7 @@ def objective(
     start, steps = (config.coarse_steps, config.fine_steps) if moving else (0, config.coarse_steps)
     eta = losses.eta(state.step - start, steps, cfg) if cfg.eta_restarts else losses.eta(state.step, config.steps, cfg)
     target, counted = targets(batch, output.images.lowlight)
-    measured = output._replace(depth=output.depth / length_unit(state.scene, config.model))
+    measured = output._replace(depth=output.depth / length_unit(state.scene.extent, config.model))
     loss, terms = losses.total(measured, target, cfg, eta, exponent_target(config))
     if moving:
         smoothness, time_smoothness, time_l1 = hexplane.regularisers(params.hexplane)
@@ -137,7 +137,7 @@ def size_terms(scene: Scene, config: Config, moving: bool) -> losses.Terms:
     def scale() -> Float[Array, ""]:
         # Garbage in a dead row could overflow the exponential, and 0 * inf would be a gradient of NaN.
         scales = jnp.exp(jnp.where(alive[:, None], gaussians.log_scales, 0))
-        return mean(scales.mean(-1)) / length_unit(scene, config.model)
+        return mean(scales.mean(-1)) / length_unit(scene.extent, config.model)
 
     terms: losses.Terms = {
         "opacity": (cfg.opacity, lambda: mean(jax.nn.sigmoid(gaussians.logit_opacities))),
@@ -225,12 +225,13 @@ def _disturbed(gaussians: Gaussians, state: TrainState, config: Config) -> Gauss
     scene, cfg = state.scene, config.density
     rate = optimizer.learning_rate(state.adam.schedules["means"], state.adam.step + 1)
     size = cfg.noise * rate / jnp.where(scene.extent > 0, scene.extent, 1) ** 2
-    return relocation.disturb(gaussians, scene.alive, size, _key(state, config, 1), cfg.prune_opacity)
+    key = jax.random.fold_in(_key(state, config), 1)
+    return relocation.disturb(gaussians, scene.alive, size, key, cfg.prune_opacity)
 
 
-def _key(state: TrainState, config: Config, purpose: int) -> PRNGKeyArray:
-    """Randomness of this step for one purpose."""
-    return jax.random.fold_in(jax.random.fold_in(jax.random.key(config.seed), state.step), purpose)
+def _key(state: TrainState, config: Config) -> PRNGKeyArray:
+    """Randomness of this step."""
+    return jax.random.fold_in(jax.random.key(config.seed), state.step)
 
 
 def adam(params: SceneParams, rates: dict[str, optimizer.Schedule], config: Config) -> optimizer.Transformation:
@@ -261,13 +262,12 @@ def densify(state: TrainState, config: Config, growths_left: Int[Array, ""] | in
         config: settings.
         growths_left: how often the stage grows from now on, this time included.
     """
-    scene, cfg = state.scene, config.density
+    scene, cfg, key = state.scene, config.density, _key(state, config)
     if cfg.method == "mcmc":
         count = relocation.population(scene.alive.sum(), densification.most_gaussians(cfg), growths_left)
-        key = _key(state, config, 0)
-        result = relocation.relocate(scene.params.gaussians, scene.alive, count, key, cfg.prune_opacity)
+        own = jax.random.fold_in(key, 0)
+        result = relocation.relocate(scene.params.gaussians, scene.alive, count, own, cfg.prune_opacity)
     else:
-        key = jax.random.fold_in(jax.random.key(config.seed), state.step)
         result = densification.densify(scene.params.gaussians, scene.alive, state.stats, scene.extent, key, cfg)
 
     def forget(rows: Float[Array, "..."]) -> Float[Array, "..."]:

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from tiny_training import make_dataset, tiny
 
 from l2dgs_jax.rasterizer import rasterize
@@ -124,14 +125,7 @@ def test_only_faint_gaussians_wander_and_by_their_own_covariance():
         if name != "means":
             np.testing.assert_array_equal(after, before)
     steps = np.asarray(moved.means - rows.means)[:-5]
-    w, x, y, z = rows.quats[0] / jnp.linalg.norm(rows.quats[0])
-    turn = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    turn = Rotation.from_quat(rows.quats[0], scalar_first=True).as_matrix()
     covariance = turn @ np.diag(np.exp(2 * np.asarray(rows.log_scales[0]))) @ turn.T
     gate = 1 / (1 + np.exp(-100 * DEAD))
     expected = (0.7 * gate) ** 2 * covariance @ covariance
