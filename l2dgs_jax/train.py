@@ -16,6 +16,7 @@ from l2dgs_jax.data import Dataset, load_dataset
 from l2dgs_jax.data.images import write_image
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.runs import Checkpoint, Recorder, Run, checkpoints
+from l2dgs_jax.runs.advice import misfit
 from l2dgs_jax.runtime import command_line, devices, distributed
 from l2dgs_jax.runtime.distributed import Hosts
 from l2dgs_jax.runtime.files import is_taken
@@ -29,7 +30,8 @@ class Train:
 
     Attributes:
         scene: folder of the scene, or "demo" for the clip that comes with the package.
-        preset: settings to start from (default, paper, authors or demo); the options below override single ones.
+        preset: settings to start from: demo, fast, default, best, paper or authors (docs/presets.md says what each of
+            them takes); the options below override single ones.
         output: run folder; a fresh one under runs/ if not given.
         resume: continue the run in the output folder from its last checkpoint.
         devices: how many devices the views of a step are spread over; each core of a processor is one. If not given,
@@ -60,7 +62,7 @@ def _train(options: Train) -> None:
     assert folder is not None
     _check_devices(options)
     dataset = load_dataset(options.scene, config.downscale, config.format, config.held_out, config.frame_memory)
-    config = resolve(config, dataset.train)
+    config = resolve(config, dataset)
     if options.resume:
         start = checkpoints.load(folder / runs.CHECKPOINT, config, len(dataset.train.names))
     else:
@@ -81,6 +83,9 @@ def _record(dataset: Dataset, options: Train, config: Config, start: Checkpoint)
         runs.write_settings(folder, options.scene, config)
     for note in dataset.notes:
         print(f"note: {note}")
+    warning = misfit(dataset, config)
+    if warning:
+        print(f"warning: {warning}")
     print(f"{dataset.name}: {len(dataset.train.names)} frames of {dataset.width}x{dataset.height}; run folder {folder}")
     try:
         run = _fit_with_progress(dataset, options, config, start)

@@ -141,13 +141,18 @@ class BAFENet(NamedTuple):
 
 
 class SceneParams(NamedTuple):
-    """Everything that is learned."""
+    """Everything that is learned.
+
+    Of these, `exposures` says nothing of the scene but of the frames that it was learned from, and takes no part in
+    rendering: logarithms of the gains of the training frames' channels, None if the camera's exposure did not change.
+    """
 
     gaussians: Gaussians
     hexplane: HexPlane
     heads: MotionHeads
     ocd: OCDNet
     bafe: BAFENet
+    exposures: Float[Array, "*B F 3"] | None = None
 
 
 class Scene(NamedTuple):

@@ -38,7 +38,7 @@ def folder(base):
         identity_start=False,
     )
     dataset = load_dataset(scene)
-    config = resolve(dataclasses.replace(preset, coarse_steps=3, fine_steps=3, model=model), dataset.train)
+    config = resolve(dataclasses.replace(preset, coarse_steps=3, fine_steps=3, model=model), dataset)
     path = base / "tiny_run"
     runs.write_settings(path, str(scene), config)
     state = initial_state(dataset, config)

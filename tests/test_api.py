@@ -58,7 +58,7 @@ def test_the_readmes_programs_run_as_printed(tmp_path, monkeypatch):
     small = {"coarse_steps": 1, "fine_steps": 1, "model.hidden": 8, "model.plane_size": 4}
     config = overrides.replace(l2dgs_jax.PRESETS["demo"], small)
     dataset = l2dgs_jax.load_dataset("demo")
-    resolved = resolve(config, dataset.train)
+    resolved = resolve(config, dataset)
     runs.write_settings(Path("runs/demo"), "demo", resolved)
     state = initial_state(dataset, resolved)._replace(step=jnp.int32(2))
     checkpoints.save(Path("runs/demo") / runs.CHECKPOINT, l2dgs_jax.Checkpoint(state, 1024), resolved)

@@ -4,12 +4,14 @@ import collections
 import dataclasses
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from l2dgs_jax.config import PRESETS, DensityConfig
 from l2dgs_jax.data import Dataset, Split
 from l2dgs_jax.runtime import devices
 from l2dgs_jax.training import engine, initial_state
+from l2dgs_jax.training.batching import load_batch
 from l2dgs_jax.types import Camera
 
 WIDTH, HEIGHT, FRAMES = 16, 12, 6
@@ -23,6 +25,7 @@ def tiny(preset="default", **changes):
         base.model,
         initial_exponents=exponents,
         initial_illumination=illumination,
+        exposure="steady",
         plane_size=4,
         plane_scales=(1, 2),
         plane_channels=2,
@@ -30,8 +33,8 @@ def tiny(preset="default", **changes):
         sh_degree=1,
     )
     density = DensityConfig(start=1, stop=100, interval=3, grad_threshold=1e-9, max_gaussians=60)
-    changes = {"coarse_steps": 4, "fine_steps": 4, "sh_warmup": 3, "density": density, "model": small} | changes
-    return dataclasses.replace(base, **changes)
+    few = {"coarse_steps": 4, "fine_steps": 4, "sh_warmup": 3, "inbetweens": 0.0, "density": density, "model": small}
+    return dataclasses.replace(base, **few | changes)
 
 
 def make_dataset(seed=0):
@@ -44,6 +47,12 @@ def make_dataset(seed=0):
     images = rng.uniform(0, 0.2, (FRAMES, HEIGHT, WIDTH, 3)).astype(np.float16)
     split = Split(tuple(map(str, range(FRAMES))), cameras, images, None, None)
     return Dataset("tiny", WIDTH, HEIGHT, split, split, points, None)
+
+
+def batch_of(split, frames):
+    """A batch as arrays of jax, numbers with a fraction in the precision of the tests."""
+    batch = load_batch(split, np.array(frames))
+    return jax.tree.map(lambda x: jnp.asarray(x, float) if x.dtype.kind == "f" else jnp.asarray(x), batch)
 
 
 def finish(dataset, config, state=None, pair_capacity=None):

@@ -10,7 +10,8 @@ from l2dgs_jax.config import Config
 from l2dgs_jax.data.dataset import Dataset, Split
 from l2dgs_jax.data.stacks import stacked
 from l2dgs_jax.model.initialisation import pad_rows
-from l2dgs_jax.training import engine, initial_state
+from l2dgs_jax.training import initial_state
+from l2dgs_jax.training.batching import load_batch
 from l2dgs_jax.training.step import Batch, TrainState, begin_stage
 from l2dgs_jax.types import Camera
 
@@ -81,4 +82,4 @@ def training(count: int, width: int, height: int, config: Config) -> tuple[Train
     """A fine-stage state and a batch of noise to fit it to."""
     dataset = video(count, width, height, frames=60)
     indices = np.linspace(0, len(dataset.train.names) - 1, config.batch_size).astype(int)
-    return fine_state(dataset, config), engine.load_batch(dataset.train, indices)
+    return fine_state(dataset, config), load_batch(dataset.train, indices)

@@ -5,6 +5,7 @@ from typing import TypeVar
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+from scipy.spatial.transform import Rotation, Slerp
 
 from l2dgs_jax.types import Camera
 
@@ -40,6 +41,20 @@ def median_depth(cameras: Camera, points: Float[np.ndarray, "P 3"]) -> float:
 def select_camera(cameras: Camera, index: int) -> Camera:
     """One camera of a batch."""
     return Camera(*(x[index] for x in cameras))
+
+
+def between(cameras: Camera, first: int, second: int, part: float) -> Camera:
+    """A camera `part` of the way from one of a batch to another: its centre, intrinsics and time are weighted means.
+
+    Its orientation turns evenly from one's to the other's. In NumPy arrays of the batch's type.
+    """
+    viewmats = np.asarray(cameras.viewmat, np.float64)[[first, second]]
+    weights = np.array([1 - part, part])
+    rotation = Slerp([0, 1], Rotation.from_matrix(viewmats[:, :3, :3]))(part).as_matrix()
+    viewmat = np.eye(4)
+    viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ (weights @ camera_centres(viewmats))
+    K, time = (np.tensordot(weights, np.asarray(x, np.float64)[[first, second]], 1) for x in (cameras.K, cameras.time))
+    return Camera(*(np.asarray(x, cameras.viewmat.dtype) for x in (viewmat, K, time)))  # type: ignore[arg-type]
 
 
 def resize(camera: Camera, factor: float | int) -> Camera:

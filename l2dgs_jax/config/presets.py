@@ -1,7 +1,7 @@
 """The named presets; docs/presets.md says why each setting of `default` is what it is, and what it measures.
 
 `paper` is the text of the paper to the letter, `authors` what the authors' released code does, `default` what measures
-best, `demo` a short `default`.
+best, `fast` and `demo` a short `default`, `best` a long one.
 """
 
 import dataclasses
@@ -42,9 +42,12 @@ def _presets() -> dict[str, Config]:
         optim=OptimConfig(extent_scales=("means", "heads", "planes", "ocd", "bafe")),
     )
     default = Config(
-        coarse_steps=600,
-        fine_steps=600,
+        coarse_steps=100,  # what moves is smeared in the coarse stage: no longer than geometry needs
+        fine_steps=1500,
+        inbetweens=0.3,
+        sh_warmup=None,
         model=ModelConfig(
+            unit="depth",
             hidden=64,
             plane_scales=(1, 2),
             opacity_head=True,  # a copy of what moves can fade where it does not belong
@@ -52,6 +55,9 @@ def _presets() -> dict[str, Config]:
             reflectance_init="observed",
             initial_exponents=("auto", 9.0),
             initial_illumination="auto",
+            initial_opacity=0.3,
+            tone="auto",
+            exposure="auto",
         ),
         loss=LossConfig(
             exposure=1.0,
@@ -65,26 +71,37 @@ def _presets() -> dict[str, Config]:
             exponent_prior=0.2,
         ),
         optim=OptimConfig(
+            extent_scales=("means",),  # motion field and heads have no unit
             reflectance_lr=5e-3,  # 1e-5 moves a reflectance by 0.03 in 3,000 steps
             attenuation_lr=5e-3,
             heads_lr=1.5e-3,
             planes_lr=1.6e-2,
             ocd_lr=5e-5,
-            decay_steps=2400,  # motion would end half learned if its rates fell to their end within 600 steps
+            decay_steps=2400,  # motion would end half learned if its rates fell to their end within the run
         ),
-        # No growth: each time is a shock that takes hundreds of steps to heal.
-        density=DensityConfig(start=200, stop=0, interval=200, grad_threshold=5e-4, conserve_opacity=True),
+        # Births that leave the image as it is; nothing dies, for what moves is faint before its motion is learned.
+        density=DensityConfig(
+            method="mcmc", start=100, stop=1000, interval=50, prune_opacity=0.0, max_gaussians="auto"
+        ),
+    )
+    fast = dataclasses.replace(default, fine_steps=700, density=dataclasses.replace(default.density, stop=500))
+    best = dataclasses.replace(
+        default,
+        fine_steps=4900,
+        model=dataclasses.replace(default.model, hidden=128, plane_scales=(1, 2, 4)),
+        optim=dataclasses.replace(default.optim, decay_steps=7500),
+        density=dataclasses.replace(default.density, stop=3000),
     )
     # A smaller motion field and fewer steps.
     demo = dataclasses.replace(
         default,
-        coarse_steps=150,
-        fine_steps=250,
-        sh_warmup=150,
+        coarse_steps=100,
+        fine_steps=300,
         model=dataclasses.replace(default.model, plane_size=32, hidden=32),
         optim=dataclasses.replace(default.optim, decay_steps=None),
+        density=dataclasses.replace(default.density, stop=0),
     )
-    return {"paper": paper, "authors": authors, "default": default, "demo": demo}
+    return {"paper": paper, "authors": authors, "default": default, "fast": fast, "best": best, "demo": demo}
 
 
 PRESETS = _presets()

@@ -31,12 +31,14 @@ _PLAIN_NUMBER, _PLAIN_COUNT, _PLAIN_LENGTH = float, int, int | None
 _PLAIN_EXPONENTS = tuple[float | Literal["auto"], float] | None
 _PLAIN_MOST = int | Literal["auto"]
 _PLAIN_ILLUMINATION = float | Literal["auto"] | None
+_PLAIN_TONE = float | Literal["linear-light", "gain", "auto"]
 Number = Annotated[_Float, _arg(_PLAIN_NUMBER)]
 Count = Annotated[_Int, _arg(_PLAIN_COUNT)]
 Length = Annotated[_Int | None, _arg(_PLAIN_LENGTH)]
 Exponents = Annotated[tuple[_Float | Literal["auto"], _Float] | None, _arg(_PLAIN_EXPONENTS)]
 Most = Annotated[_Int | Literal["auto"], _arg(_PLAIN_MOST)]
 Illumination = Annotated[_Float | Literal["auto"] | None, _arg(_PLAIN_ILLUMINATION)]
+Tone = Annotated[_Float | Literal["linear-light", "gain", "auto"], _arg(_PLAIN_TONE)]
 TRACEABLE: dict[Any, Any] = {
     Number: _PLAIN_NUMBER,
     Count: _PLAIN_COUNT,
@@ -44,6 +46,7 @@ TRACEABLE: dict[Any, Any] = {
     Exponents: _PLAIN_EXPONENTS,
     Most: _PLAIN_MOST,
     Illumination: _PLAIN_ILLUMINATION,
+    Tone: _PLAIN_TONE,
 }
 
 EPS = math.exp(-5)  # of Eq. 10
@@ -62,6 +65,7 @@ RATE_GROUPS = (
     "scales",
     "quats",
     "gate",
+    "exposures",
 )
 
 
@@ -93,7 +97,12 @@ class ModelConfig:
     initial_exponents: Exponents = None
     # l of every Gaussian at the start; None: luminance of the points. "auto": what makes L^B2 the darkening's gain
     initial_illumination: Illumination = None
-    initial_opacity: Number = 0.1
+    # How the frames became dark: "linear-light", by little light; "gain", by a factor on their sRGB values; "auto",
+    # what they look like (model/tone.py); or a number, the exponent that B1 starts at where it is "auto"
+    tone: Tone = "linear-light"
+    initial_opacity: Number = 0.1  # of every Gaussian
+    # Whether every training frame has a gain of its own, learned beside the scene; "auto": if the points say so
+    exposure: Literal["steady", "drifting", "auto"] = "steady"
     background: float = 0.0  # value of L and R where nothing is drawn
 
 
@@ -156,6 +165,7 @@ class OptimConfig:
     scales_lr: Number = 5e-3
     quats_lr: Number = 1e-3
     gate_lr: Number = 0.01
+    exposures_lr: Number = 1e-3
     decay_steps: Length = 20_000  # length of the decays; None: the length of the stage
     beta1: Number = 0.9
     beta2: Number = 0.999
@@ -182,7 +192,7 @@ class DensityConfig:
     conserve_opacity: bool = False  # a new pair covers as much as its source did (arXiv 2404.06109)
     prune_opacity: Number = 0.005  # below it a Gaussian is removed, or moved to where it is needed
     prune_above: Count = 0  # prune only when more Gaussians than this exist
-    max_gaussians: Most = 360_000  # "auto": half a Gaussian a pixel of a frame, but at least the points
+    max_gaussians: Most = 360_000  # "auto": 0.3 Gaussians a pixel of a frame, but at least the points
     noise: Number = 5e5  # "mcmc": on the centres of faint Gaussians, times their learning rate
 
 
@@ -198,7 +208,10 @@ class Config:
     format: Layout = "auto"  # of the scene's folder; "auto": found from its contents
     held_out: str = "auto"  # views not trained on: the scene's own, "4dgs", or k for every k-th (data/splits.py)
     sh_warmup: int | None = 1000  # steps between activating one more SH band; None: all by half of the run
+    drop: Number = 0.0  # share of the Gaussians that a step leaves out at random, at the end of the run
     checkpoint_every: int = 500  # steps
+    # Share of the views that lie between two frames of the video, drawn by optical flow (training/inbetweens.py)
+    inbetweens: float = 0.0
     frame_memory: float = 4.0  # GiB that a scene's frames may take; beyond it they lie in temporary files
     model: ModelConfig = field(default_factory=ModelConfig)
     loss: LossConfig = field(default_factory=LossConfig)

@@ -18,6 +18,7 @@ def deform(
     *,
     moving: bool,
     sh_degree_active: Int[Array, ""] | int,
+    presence: Float[Array, " N"] | None = None,
 ) -> MovedGaussians:
     """Move and light every Gaussian for V cameras, each at its own instant.
 
@@ -29,6 +30,7 @@ def deform(
         cfg: shape of the scene.
         moving: whether the motion field and OCD-Net act (fine stage); otherwise the canonical Gaussians, with a_j = 1.
         sh_degree_active: bands of Eq. 2 above this one are left out; may be traced.
+        presence: factor on the opacities, which stay at most 1; None for 1.
 
     Returns:
         Activated Gaussians; every field has a leading axis V.
@@ -57,11 +59,12 @@ def deform(
         if motion.logit_opacities is not None:
             logit_opacities += motion.logit_opacities
         coefficients = factors * coefficients
+    opacities = jnp.where(alive[None], jax.nn.sigmoid(logit_opacities), 0)
     return MovedGaussians(
         means=means,
         quats=quats,
         scales=jnp.exp(log_scales),
-        opacities=jnp.where(alive[None], jax.nn.sigmoid(logit_opacities), 0),
+        opacities=opacities if presence is None else jnp.minimum(presence[None] * opacities, 1),
         illumination=_illumination(coefficients, gaussians.means, cameras.viewmat, cfg),
         reflectance=per_view(gaussians.reflectance),
         attenuation=per_view(gaussians.attenuation),

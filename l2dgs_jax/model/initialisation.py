@@ -1,22 +1,19 @@
 """The scene that a training starts from: one Gaussian a point."""
 
 import dataclasses
-import math
 from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, PRNGKeyArray, Shaped
+from jaxtyping import Array, Float, PRNGKeyArray, Shaped
 from scipy.spatial import cKDTree
 from scipy.special import logit
 
 from l2dgs_jax.cameras.geometry import camera_extent, median_depth
 from l2dgs_jax.config import ModelConfig
-from l2dgs_jax.data.stacks import pixel_mean, stacked
 from l2dgs_jax.model import hexplane, networks
 from l2dgs_jax.model.deformation import length_unit
-from l2dgs_jax.runtime.prefetch import prefetch
 from l2dgs_jax.types import Camera, Gaussians, Scene, SceneParams
 
 SH_DC = 0.28209479177387814  # value of the first SH basis function
@@ -24,7 +21,6 @@ LUMINANCE = np.array([0.2989, 0.587, 0.114])
 OPEN_GATE = 2.0  # logit of the factor on motion that every Gaussian starts with
 DEPTHS_PER_EXTENT = 0.25  # about the radius of a hand-held camera's path
 LEAST_SPACING = 1e-7**0.5  # of points, for the scales that Gaussians start with
-SEEN_AT_ONCE = 2**26  # colour values of points that `observed_colors` holds in memory
 
 
 def z_order(points: np.ndarray) -> np.ndarray:
@@ -47,6 +43,7 @@ def initialise(
     cfg: ModelConfig,
     capacity: int,
     reflectance: np.ndarray | None = None,
+    exposures: np.ndarray | None = None,
 ) -> Scene:
     """A scene with one Gaussian a point, ready for training.
 
@@ -62,6 +59,7 @@ def initialise(
         cfg: shape and initial state.
         capacity: rows to allocate; those past P are dead.
         reflectance: [P 3] initial reflectance, for `cfg.reflectance_init` "observed".
+        exposures: [F 3] logarithms of the frames' gains to start from, for `cfg.exposure` "drifting".
     """
     count = len(points)
     distances, _ = cKDTree(points).query(points, k=min(4, count))
@@ -83,6 +81,7 @@ def initialise(
         reflectance,
         bias,
         extent,
+        exposures,
     )
     return _initialise(
         key,
@@ -102,7 +101,7 @@ def scene_shapes(cfg: ModelConfig, num_frames: int) -> Scene:
     """
     rows = [
         jax.ShapeDtypeStruct(shape, jnp.zeros(()).dtype)
-        for shape in ((1, 3), (2, 3), (1,), (1,), (1,), (1, 3), (2,), ())
+        for shape in ((1, 3), (2, 3), (1,), (1,), (1,), (1, 3), (2,), (), (num_frames, 3))
     ]
     build = partial(_initialise, cfg=_static_settings(cfg), num_frames=num_frames, capacity=1)
     return jax.eval_shape(build, jax.eval_shape(lambda: jax.random.key(0)), *rows)
@@ -132,6 +131,7 @@ def _initialise(
     reflectance: Float[Array, "P 3"] | None,
     exponent_bias: Float[Array, "2"] | None,
     extent: Float[Array, ""],
+    exposures: Float[Array, "F 3"] | None,
     *,
     cfg: ModelConfig,
     num_frames: int,
@@ -158,6 +158,7 @@ def _initialise(
         heads=networks.init_heads(keys[3], cfg.plane_channels * len(cfg.plane_scales), cfg),
         ocd=networks.init_ocd(keys[4], cfg),
         bafe=networks.init_bafe(keys[5], exponent_bias),
+        exposures=exposures if cfg.exposure == "drifting" else None,
     )
     return Scene(
         params=params,
@@ -165,52 +166,6 @@ def _initialise(
         bounds=bounds,
         extent=extent,
     )
-
-
-def observed_colors(
-    points: Float[np.ndarray, "P 3"],
-    cameras: Camera,
-    images: Float[np.ndarray, "F H W 3"],
-    valid: Bool[np.ndarray, "F H W"] | None = None,
-) -> Float[np.ndarray, "P 3"]:
-    """Median colour of the pixels that each point projects to, occlusion ignored; the mean where none are.
-
-    Memory is bounded whatever the numbers of frames and points: colours that take much lie in a temporary file.
-
-    Args:
-        points: world units.
-        cameras: F cameras.
-        images: their images, sRGB in [0, 1].
-        valid: which pixels count; None for all.
-    """
-    height, width = images.shape[1:3]
-
-    def seen_in(frame: int) -> Float[np.ndarray, "P 3"]:
-        """Colours of the points, NaN where they are not to be seen."""
-        viewmat, K, image = np.asarray(cameras.viewmat[frame]), cameras.K[frame], images[frame]
-        x, y, z = K @ (viewmat[:3, :3] @ points.T + viewmat[:3, 3:])
-        depth = np.where(z > 0, z, np.inf)
-        column, row = np.floor(x / depth).astype(int), np.floor(y / depth).astype(int)
-        inside = (z > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
-        if valid is not None:
-            inside[inside] = valid[frame][row[inside], column[inside]]
-        colors = np.full((len(points), 3), np.nan, images.dtype)
-        colors[inside] = image[row[inside], column[inside]]
-        return colors
-
-    shape = (len(images), len(points), 3)
-    seen = stacked(prefetch(seen_in, range(len(images))), shape, images.dtype, in_file=math.prod(shape) > SEEN_AT_ONCE)
-    some = max(SEEN_AT_ONCE // (3 * len(images)), 1)
-    parts = [_median(seen[:, start : start + some].astype(np.float32)) for start in range(0, len(points), some)]
-    colors = np.concatenate(parts)
-    return np.where(np.isnan(colors).all(-1, keepdims=True), pixel_mean(images, valid).astype(colors.dtype), colors)
-
-
-def _median(seen: Float[np.ndarray, "F P 3"]) -> Float[np.ndarray, "P 3"]:
-    """Median over the frames, without those that are NaN."""
-    last = np.count_nonzero(~np.isnan(seen), axis=0, keepdims=True) - 1
-    seen = np.sort(seen, axis=0)  # NaN last
-    return np.take_along_axis(seen, np.concatenate([last // 2, (last + 1) // 2]), axis=0).mean(0)
 
 
 def pad_rows(rows: Shaped[Array, "N ..."], capacity: int) -> Shaped[Array, "M ..."]:

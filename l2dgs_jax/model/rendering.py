@@ -32,6 +32,7 @@ def render(
     sh_degree: Int[Array, ""] | int,
     pair_capacity: int | None,
     means2d_probe: Float[Array, "V N 2"] | None = None,
+    presence: Float[Array, " N"] | None = None,
 ) -> RenderOutput:
     """Render V views, each at its own instant (Eqs. 1-9).
 
@@ -47,8 +48,9 @@ def render(
         sh_degree: SH bands in use, 0 ... cfg.sh_degree.
         pair_capacity: size of the rasterizer's pair buffer for all views; None only outside jit.
         means2d_probe: zeros whose gradient is dL/d(mean2d) in pixels.
+        presence: see `deform`.
     """
-    moved = deform(scene, cameras, cfg, moving=moving, sh_degree_active=sh_degree)
+    moved = deform(scene, cameras, cfg, moving=moving, sh_degree_active=sh_degree, presence=presence)
     drawn = rasterize(
         moved.means,
         moved.quats,

@@ -1,10 +1,22 @@
 """What underexposure does to an sRGB image: where B1 and L_w start."""
 
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
+import cv2
 import numpy as np
+from jaxtyping import Bool, Float
 
 from l2dgs_jax.data.color import linear_to_srgb, srgb_to_linear
+
+Tone = Literal["linear-light", "gain"]
+
+LEAST_EXPONENT, MOST_EXPONENT = 1.01, 2.0  # B1 can come close to 1, not reach it
+# Frames are clean if the smoothest of their windows deviate less than that from a plane, and flat if the log of their
+# grey values does so from its mean.
+CLEAN, FLAT = 1 / 255, 0.5
+SMOOTHEST = 0.1  # share of the windows
+WINDOW = 7  # pixels
+LOOKED_AT = 12  # frames
 
 
 class Darkening(NamedTuple):
@@ -14,8 +26,8 @@ class Darkening(NamedTuple):
     gain: float
 
 
-def darkening(dark_level: float, lit_level: float) -> Darkening:
-    """The power law that best describes an underexposed sRGB image of mean `dark_level`.
+def darkening(dark_level: float, lit_level: float, tone: Tone | float = "linear-light") -> Darkening:
+    """The power law that describes an underexposed sRGB image of mean `dark_level`.
 
     Light scaled by k before the sRGB curve is close to a gain times a power of the well-exposed value after it, with
     an exponent above 1 that grows with darkness. k follows from the two levels; the law is fitted by least squares in
@@ -24,9 +36,42 @@ def darkening(dark_level: float, lit_level: float) -> Darkening:
     Args:
         dark_level: mean sRGB value of the dark frames, in (0, 1).
         lit_level: mean sRGB value that a well-lit image is expected to have.
+        tone: how it became dark: "linear-light", as a camera does; by a "gain" on sRGB values, as many programs do; or
+            the exponent itself.
     """
-    dark, lit = srgb_to_linear(np.array([dark_level, lit_level]))
-    well = np.linspace(0.1, 0.9, 81)
-    low = linear_to_srgb(min(dark / lit, 1.0) * srgb_to_linear(well))
-    exponent = np.clip(np.polyfit(np.log(well), np.log(low), 1)[0], 1.01, 2.0)
-    return Darkening(float(exponent), float(np.exp(np.mean(np.log(low) - exponent * np.log(well)))))
+    if tone == "linear-light":
+        dark, lit = srgb_to_linear(np.array([dark_level, lit_level]))
+        well = np.linspace(0.1, 0.9, 81)
+        low = linear_to_srgb(min(dark / lit, 1.0) * srgb_to_linear(well))
+        exponent = np.clip(np.polyfit(np.log(well), np.log(low), 1)[0], LEAST_EXPONENT, MOST_EXPONENT)
+        return Darkening(float(exponent), float(np.exp(np.mean(np.log(low) - exponent * np.log(well)))))
+    exponent = LEAST_EXPONENT if tone == "gain" else float(tone)
+    return Darkening(exponent, min(dark_level / lit_level**exponent, 1.0))
+
+
+def recognise(images: Float[np.ndarray, "F H W 3"], valid: Bool[np.ndarray, "F H W"] | None = None) -> Tone:
+    """How dark frames became dark, as far as they tell.
+
+    A sensor that sees little light is noisy, and what its scaled light loses in level the sRGB curve returns as
+    contrast. Frames that are both clean and flat were darkened by a gain. A camera's own noise reduction and a scene
+    of little contrast can look the same: only then is the answer wrong, and the user's to correct.
+
+    Args:
+        images: sRGB values in [0, 1].
+        valid: which pixels count; None for all.
+    """
+    noise, levels = [], []
+    for index in np.unique(np.linspace(0, len(images) - 1, LOOKED_AT).round().astype(int)):
+        image = images[index].astype(np.float32)
+        counted = np.ones(image.shape[:2], bool) if valid is None else valid[index]
+        noise.append(_roughness(image)[counted])
+        levels.append(image.mean(-1)[counted])
+    clean = np.quantile(np.concatenate(noise), SMOOTHEST) < CLEAN
+    flat = np.log(np.maximum(np.concatenate(levels), 0.5 / 255)).std() < FLAT
+    return "gain" if clean and flat else "linear-light"
+
+
+def _roughness(image: Float[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H W"]:
+    """Deviation of what is left of the pixels around each one when planes are taken away (Immerkaer, 1996)."""
+    rest = cv2.filter2D(image, -1, np.outer([1, -2, 1], [1, -2, 1]).astype(np.float32)) / 6
+    return np.sqrt(cv2.blur(np.square(rest).mean(-1), (WINDOW, WINDOW)))

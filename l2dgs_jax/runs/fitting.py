@@ -45,7 +45,7 @@ def fit(
     mesh = devices.mesh(views=device_count)
     if dataset.source:
         config = dataclasses.replace(config, **dataset.source.settings)
-    config = resolve(config, dataset.train)
+    config = resolve(config, dataset)
     state, pair_capacity = start or Checkpoint(initial_state(dataset, config))
     member = Member(dataset.train, config, state)
     for progress in engine.run([member], pair_capacity, mesh):

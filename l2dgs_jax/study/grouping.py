@@ -38,7 +38,7 @@ def load_groups(spec: Spec) -> list[list[Trial]]:
         if source not in datasets:
             datasets[source] = load_dataset(*source)
         dataset = datasets[source]
-        trial = Trial(plan, dataset, resolve(c, dataset.train))
+        trial = Trial(plan, dataset, resolve(c, dataset))
         groups.setdefault((overrides.outline(trial.config), *_shapes(trial).values()), []).append(trial)
     if spec.one_program and len(groups) > 1:
         raise UserError(_difference(list(groups.values())))

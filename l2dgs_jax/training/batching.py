@@ -1,7 +1,47 @@
-"""The order in which training sees its views."""
+"""What training sees in which step."""
+
+from typing import Any
 
 import numpy as np
 from jaxtyping import Int
+
+from l2dgs_jax.config import Config
+from l2dgs_jax.data.dataset import Split
+from l2dgs_jax.training.inbetweens import Flows, draw
+from l2dgs_jax.training.step import Batch
+from l2dgs_jax.types import Camera
+
+
+def next_batch(split: Split, config: Config, step: int, flows: Flows | None) -> Batch:
+    """The views of one training step, a pure function of its arguments.
+
+    Args:
+        split: frames to learn from.
+        config: seed, batch size, and the share of views between frames.
+        step: of the run, from 0.
+        flows: between the frames; None if all views are to be frames.
+    """
+    seed = int(config.seed)
+    indices = view_indices(seed, step, config.batch_size, len(split.names))
+    batch = load_batch(split, indices)
+    if flows is None:
+        return batch
+    valid = np.ones(batch.images.shape[:-1], bool) if batch.valid is None else batch.valid
+    rows: Any = (*batch.cameras, batch.images, valid)
+    chances, parts = np.random.default_rng((seed % 2**64, step, 1)).random((2, config.batch_size))
+    for row, frame in enumerate(indices.tolist()):
+        if chances[row] < config.inbetweens and flows.following[frame] != frame:
+            view = draw(split, flows, frame, float(parts[row]))
+            for stack, own in zip(rows, (*view.camera, view.image, view.valid), strict=True):
+                stack[row] = own
+    return batch._replace(valid=valid)  # type: ignore[arg-type]
+
+
+def load_batch(split: Split, indices: Int[np.ndarray, " V"]) -> Batch:
+    """The frames of `indices`."""
+    valid = None if split.valid is None else split.valid[indices]
+    cameras = Camera(*(x[indices] for x in split.cameras))
+    return Batch(cameras, split.images[indices], np.asarray(indices, np.int32), valid)  # type: ignore[arg-type]
 
 
 def view_indices(seed: int, step: int, batch_size: int, num_frames: int) -> Int[np.ndarray, " B"]:

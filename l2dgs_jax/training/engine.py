@@ -20,7 +20,8 @@ from l2dgs_jax.runtime import devices
 from l2dgs_jax.runtime.capacity import next_capacity
 from l2dgs_jax.runtime.devices import MEMBERS, VIEWS
 from l2dgs_jax.runtime.prefetch import prefetch
-from l2dgs_jax.training.batching import view_indices
+from l2dgs_jax.training.batching import load_batch, next_batch
+from l2dgs_jax.training.inbetweens import neighbour_flows
 from l2dgs_jax.training.step import (
     Batch,
     StepReport,
@@ -31,7 +32,7 @@ from l2dgs_jax.training.step import (
     tree_where,
     with_capacity,
 )
-from l2dgs_jax.types import Camera, Scene
+from l2dgs_jax.types import Scene
 
 T = TypeVar("T")
 
@@ -95,8 +96,12 @@ def run(members: Sequence[Member], pair_capacity: int | None = None, mesh: Mesh 
     static, columns = overrides.partition([member.config for member in members])
     values = devices.shard({name: _stack(column) for name, column in columns.items()}, mesh, MEMBERS)
 
+    splits = {id(member.split): member.split for member in members}
+    flows = {key: neighbour_flows(split) if config.inbetweens else None for key, split in splits.items()}
     steps = range(start, config.steps)
-    read = prefetch(lambda step: _stack([_next_batch(member, step) for member in members]), steps)
+    read = prefetch(
+        lambda step: _stack([next_batch(m.split, m.config, step, flows[id(m.split)]) for m in members]), steps
+    )
     with contextlib.closing(read):  # its threads read the next batches while a step is computed
         for step, batches in zip(steps, read, strict=True):
             moving = step >= config.coarse_steps
@@ -251,11 +256,6 @@ def _stack_states(states: Sequence[TrainState]) -> TrainState:
     return jax.tree.map(lambda *x: jnp.stack(x), *[with_capacity(state, capacity) for state in states])
 
 
-def _next_batch(member: Member, step: int) -> Batch:
-    split, config = member.split, member.config
-    return load_batch(split, view_indices(int(config.seed), step, config.batch_size, len(split.names)))
-
-
 def _complaint(report: StepReport, step: int) -> str:
     """What was found in the last member that diverged, as far as this process can see it."""
     terms = {name: value.addressable_shards[0].data[0] for name, value in report.terms.items()}
@@ -273,12 +273,6 @@ def first_capacity(split: Split, scene: Scene, views: int) -> int:
     rows = (gaussians.means, gaussians.quats, jnp.exp(gaussians.log_scales), opacities)
     per_view = (jnp.broadcast_to(x[None], (views, *x.shape)) for x in rows)
     return next_capacity(MARGIN * float(count_pairs(*per_view, cameras.viewmat, cameras.K, width, height)))
-
-
-def load_batch(split: Split, indices: Int[np.ndarray, " V"]) -> Batch:
-    """The views of `indices`."""
-    valid = None if split.valid is None else split.valid[indices]
-    return Batch(Camera(*(x[indices] for x in split.cameras)), split.images[indices], valid)
 
 
 def growths_left(stage_step: int, stage_steps: int, config: Config) -> int:

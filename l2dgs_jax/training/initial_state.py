@@ -8,25 +8,34 @@ import jax.numpy as jnp
 from l2dgs_jax.config import Config, overrides
 from l2dgs_jax.data.dataset import Dataset, Split
 from l2dgs_jax.model import networks
-from l2dgs_jax.model.initialisation import initialise, observed_colors, scene_shapes, z_order
-from l2dgs_jax.model.tone import Darkening, darkening
+from l2dgs_jax.model.initialisation import initialise, scene_shapes, z_order
+from l2dgs_jax.model.observation import exposures, observed_colors
+from l2dgs_jax.model.tone import Darkening, darkening, recognise
 from l2dgs_jax.runtime.capacity import next_capacity
 from l2dgs_jax.training.step import TrainState, begin_stage
 
-GAUSSIANS_PER_PIXEL = 0.5  # of a frame
+GAUSSIANS_PER_PIXEL = 0.3  # of a frame
+DRIFT = 0.05  # standard deviation of the logarithms of the frames' gains from which exposure counts as drifting
 
 
 def split_darkening(split: Split, config: Config) -> Darkening:
     """How the frames are darker than `config.loss.exposure_level`."""
-    return darkening(split.mean_level, float(config.loss.exposure_level))
+    tone = config.model.tone
+    if tone == "auto":
+        tone = recognise(split.images, split.valid)
+    return darkening(split.mean_level, float(config.loss.exposure_level), tone)  # type: ignore[arg-type]
 
 
-def resolve(config: Config, split: Split) -> Config:
-    """The settings with what they leave to the data filled in from the training frames."""
+def resolve(config: Config, dataset: Dataset) -> Config:
+    """The settings with what they leave to the data filled in from points and training frames."""
+    split = dataset.train
     if config.density.max_gaussians == "auto":
         height, width = split.images.shape[1:3]
         most = round(GAUSSIANS_PER_PIXEL * height * width)
         config = overrides.replace(config, {"density.max_gaussians": most})
+    if config.model.exposure == "auto":
+        drift = exposures(dataset.points, split.cameras, split.images, split.valid).std(0).max() > DRIFT
+        config = overrides.replace(config, {"model.exposure": "drifting" if drift else "steady"})
     model = config.model
     if "auto" not in (*(model.initial_exponents or ()), model.initial_illumination):
         return config
@@ -53,7 +62,11 @@ def initial_state(dataset: Dataset, config: Config) -> TrainState:
         law = split_darkening(train, config)
         observed = observed_colors(points, train.cameras, train.images, train.valid)
         reflectance = (observed / law.gain) ** (1 / law.exponent)
-    scene = initialise(jax.random.key(config.seed), points, colors, train.cameras, config.model, capacity, reflectance)
+    gains = None
+    if config.model.exposure == "drifting":
+        gains = exposures(points, train.cameras, train.images, train.valid)
+    key = jax.random.key(config.seed)
+    scene = initialise(key, points, colors, train.cameras, config.model, capacity, reflectance, gains)
     return _begin_stage(scene, jnp.zeros((), jnp.int32), config, config.coarse_steps)
 
 

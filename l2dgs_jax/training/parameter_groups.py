@@ -36,6 +36,7 @@ def groups(params: SceneParams) -> SceneParams:
         heads=label("heads", params.heads),
         ocd=label("ocd", params.ocd),
         bafe=label("bafe", params.bafe),
+        exposures=label("exposures", params.exposures),
     )
 
 
@@ -61,6 +62,7 @@ def schedules(cfg: OptimConfig, extent: Float[Array, ""], stage_steps: int) -> d
         "scales": (cfg.scales_lr, cfg.scales_lr),
         "quats": (cfg.quats_lr, cfg.quats_lr),
         "gate": (cfg.gate_lr, cfg.gate_lr),
+        "exposures": (cfg.exposures_lr, cfg.exposures_lr),
     }
     steps = jnp.maximum(stage_steps if cfg.decay_steps is None else cfg.decay_steps, 1)
     factor = lambda name: extent if name in cfg.extent_scales else jnp.ones_like(extent)

@@ -22,10 +22,18 @@ T = TypeVar("T")
 
 
 class Batch(NamedTuple):
-    """The views of one step; images are sRGB in [0, 1], and nothing is learned where they are not `valid`."""
+    """The views of one step.
+
+    Attributes:
+        cameras: of the views.
+        images: sRGB in [0, 1].
+        frames: which of the training frames they are.
+        valid: where there is something to learn; None for everywhere.
+    """
 
     cameras: Camera
     images: Float[Array, "*S V H W 3"]
+    frames: Int[Array, "*S V"]
     valid: Bool[Array, "*S V H W"] | None = None
 
 
@@ -109,19 +117,21 @@ def objective(
         sh_degree=sh_degree(state.step, config),
         pair_capacity=pair_capacity,
         means2d_probe=probe,
+        presence=presence(state, config),
     )
     cfg = config.loss
     start, steps = (config.coarse_steps, config.fine_steps) if moving else (0, config.coarse_steps)
     eta = losses.eta(state.step - start, steps, cfg) if cfg.eta_restarts else losses.eta(state.step, config.steps, cfg)
-    target, counted = targets(batch, output.images.lowlight)
-    measured = output._replace(depth=output.depth / length_unit(state.scene.extent, config.model))
+    images = output.images._replace(lowlight=exposed(output.images.lowlight, params.exposures, batch.frames))
+    target, counted = targets(batch, images.lowlight)
+    measured = output._replace(images=images, depth=output.depth / length_unit(state.scene.extent, config.model))
     loss, terms = losses.total(measured, target, cfg, eta, exponent_target(config))
     if moving:
         smoothness, time_smoothness, time_l1 = hexplane.regularisers(params.hexplane)
         loss += cfg.plane_smoothness * smoothness + cfg.time_smoothness * time_smoothness + cfg.time_l1 * time_l1
     size, sizes = losses.weighted_sum(size_terms(state.scene._replace(params=params), config, moving))
     loss, terms = loss + size, terms | sizes
-    squares = jnp.mean(jnp.square(jax.lax.stop_gradient(output.images.lowlight) - target))
+    squares = jnp.mean(jnp.square(jax.lax.stop_gradient(images.lowlight) - target))
     mse = _mean(squares, axis) / _mean(counted, axis)
     report = StepReport(loss, terms, -10 * jnp.log10(mse), output.pairs, output.overflow, jnp.isfinite(loss))
     return loss, (report, output.radii)
@@ -147,6 +157,30 @@ def size_terms(scene: Scene, config: Config, moving: bool) -> losses.Terms:
         gate = gaussians.gate
         terms["gate"] = (cfg.gate, lambda: mean(jax.nn.sigmoid(gate)))
     return terms
+
+
+def presence(state: TrainState, config: Config) -> Float[Array, " N"] | None:
+    """Factors on the opacities of this step: 0 for those that it leaves out (DropGaussian, arXiv 2504.09491).
+
+    Their share grows evenly up to `config.drop` at the end of the run; the others make up for it.
+    """
+    if isinstance(config.drop, float) and config.drop == 0:
+        return None
+    share = config.drop * state.step.astype(state.stats.seen.dtype) / config.steps
+    key = jax.random.fold_in(_key(state, config), 3)
+    return jax.random.bernoulli(key, 1 - share, state.scene.alive.shape) / (1 - share)
+
+
+def exposed(
+    lowlight: Float[Array, "V H W 3"], exposures: Float[Array, "F 3"] | None, frames: Int[Array, " V"]
+) -> Float[Array, "V H W 3"]:
+    """Low-light estimates as the camera exposed those training frames; both carry gradients.
+
+    Gains count relative to their geometric mean, which the scene's own brightness stands for.
+    """
+    if exposures is None:
+        return lowlight
+    return lowlight * jnp.exp(exposures - exposures.mean(0, keepdims=True))[frames][:, None, None]
 
 
 def targets(
@@ -184,7 +218,8 @@ def train_step(
         axis: of `jax.shard_map`, over which the views of the batch are spread. Gradients and statistics are those of
             all views, and every device returns the same.
     """
-    batch = jax.tree.map(lambda x: x if x.dtype == bool else x.astype(state.stats.seen.dtype), batch)
+    dtype = state.stats.seen.dtype
+    batch = jax.tree.map(lambda x: x.astype(dtype) if jnp.issubdtype(x.dtype, jnp.floating) else x, batch)
 
     def value_and_grad(params: SceneParams) -> tuple:
         probe = jnp.zeros((*batch.cameras.time.shape, state.scene.alive.shape[0], 2), batch.images.dtype)

@@ -12,7 +12,7 @@ import pytest
 from scipy.optimize import minimize_scalar
 from skimage.metrics import structural_similarity
 
-from l2dgs_jax import runs
+from l2dgs_jax import metrics, runs
 from l2dgs_jax.cameras.geometry import select_camera
 from l2dgs_jax.data import load_dataset
 from l2dgs_jax.errors import UserError
@@ -104,6 +104,20 @@ def test_lowlight_scores_are_scikit_images(result, rendered):
         np.testing.assert_allclose(scores["psnr"], psnr(rendered["lowlight"], rendered["input"], masks), atol=1e-3)
         np.testing.assert_allclose(scores["ssim"], ssim(rendered["lowlight"], rendered["input"], masks), atol=1e-3)
     np.testing.assert_allclose(result["mask_area"], rendered["masks"].mean())
+
+
+def test_of_drifting_exposures_each_frame_is_scored_after_its_own_gain(run, result, rendered):
+    assert result["lowlight_gain"] == "none"
+    params = run.state.scene.params._replace(exposures=np.zeros((len(run.dataset.train.names), 3), np.float32))
+    drifting = dataclasses.replace(run, state=run.state._replace(scene=run.state.scene._replace(params=params)))
+    scores = evaluate(drifting)
+    assert scores["lowlight_gain"] == "own"
+    assert "low light x gain" in table(scores)
+    pairs = zip(rendered["lowlight"], rendered["input"], strict=True)
+    gained = [np.clip(metrics.best_gain([(estimate, seen)]) * estimate, 0, 1) for estimate, seen in pairs]
+    np.testing.assert_allclose(scores["lowlight"]["psnr"], psnr(gained, rendered["input"]), atol=1e-3)
+    assert scores["lowlight"]["psnr"] > result["lowlight"]["psnr"]
+    assert scores["welllit"] == result["welllit"]
 
 
 def test_welllit_scores_are_scikit_images(result, rendered):

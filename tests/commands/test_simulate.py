@@ -105,6 +105,22 @@ def test_one_exposure_a_video_or_one_an_image_both_seeded(scene, tmp_path):
     assert to_bytes(load_dataset(tmp_path / "image").train.images).mean((1, 2, 3)).std() > 0.5
 
 
+def test_a_drifting_exposure_changes_the_light_slowly(scene, tmp_path):
+    steady = ["--exposure", 0.06]
+    for name, options in {"steady": steady, "drifting": [*steady, "--exposure-drift", 0.3]}.items():
+        run(scene, tmp_path / name, *options)
+    frames = report(tmp_path / "drifting")["frames"]
+    splits = [getattr(load_dataset(tmp_path / "drifting"), part) for part in ("train", "test")]
+    times = {name: time for split in splits for name, time in zip(split.names, split.cameras.time, strict=True)}
+    lights = np.array([frames[name]["light"] for name in sorted(times, key=times.get)])
+    assert np.all(np.abs(lights - 1) <= 0.3)
+    assert np.ptp(lights) > 0.3
+    before = {name: frame["level"] for name, frame in report(tmp_path / "steady")["frames"].items()}
+    darker = [name for name, frame in frames.items() if frame["light"] < 0.95]
+    assert all(frames[name]["level"] < before[name] for name in darker)
+    assert {frame["light"] for frame in report(tmp_path / "steady")["frames"].values()} == {1.0}
+
+
 def test_noise_is_seeded_and_differs_from_frame_to_frame(scene, tmp_path):
     noisy = ["--exposure", 0.06, "--photons", 300]
     for name, options in {"clean": noisy[:2], "one": noisy, "same": noisy, "two": [*noisy, "--seed", 1]}.items():
@@ -138,6 +154,7 @@ def test_weights_of_the_release_and_brightening(scene, tmp_path):
         (["--exposure-range", "0.2", "0.1"], ["--exposure-range", "0.2 ... 0.1"]),
         (["--exposure-range", "0.2", "1"], ["--exposure-range"]),
         (["--exposure", "0.7"], ["blobs", "0.700", "--exposure"]),
+        (["--exposure-drift", "1"], ["--exposure-drift 1"]),
         (["--photons", "0"], ["--photons"]),
         (["--photons", "inf"], ["--photons"]),
         (["--seed", "-1"], ["--seed -1"]),

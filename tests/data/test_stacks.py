@@ -12,8 +12,9 @@ from l2dgs_jax import data
 from l2dgs_jax.config import PRESETS
 from l2dgs_jax.data.stacks import MappedArray, pixel_mean, stacked
 from l2dgs_jax.errors import UserError
-from l2dgs_jax.model.initialisation import observed_colors
-from l2dgs_jax.training import engine, resolve
+from l2dgs_jax.model.observation import observed_colors
+from l2dgs_jax.training import resolve
+from l2dgs_jax.training.batching import load_batch
 
 STATUS = Path("/proc/self/status")
 
@@ -102,13 +103,13 @@ def test_a_scene_beyond_its_budget_is_the_same_scene(scene, place):
             np.testing.assert_array_equal(a, b)
     assert not memory.train.valid.all()
 
-    config = resolve(PRESETS["demo"], memory.train)
-    assert resolve(PRESETS["demo"], file.train) == config
+    config = resolve(PRESETS["demo"], memory)
+    assert resolve(PRESETS["demo"], file) == config
     seen, batches = [], []
     for dataset in (memory, file):
         train = dataset.train
         seen.append(observed_colors(dataset.points, train.cameras, train.images, train.valid))
-        batches.append(engine.load_batch(train, np.array([3, 1])))
+        batches.append(load_batch(train, np.array([3, 1])))
     np.testing.assert_array_equal(*seen)
     for x, y in zip(*map(jax.tree.leaves, batches), strict=True):
         np.testing.assert_array_equal(x, y)

@@ -4,13 +4,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from tiny_training import HEIGHT, WIDTH, make_dataset, tiny
+from tiny_training import HEIGHT, WIDTH, batch_of, make_dataset, tiny
 
 from l2dgs_jax.cameras import select_camera
 from l2dgs_jax.kernels import use_kernels
 from l2dgs_jax.model.rendering import render
 from l2dgs_jax.rasterizer import rasterize
-from l2dgs_jax.training import engine, initial_state
+from l2dgs_jax.training import initial_state
 from l2dgs_jax.training.step import train_step
 
 MARKS = ("small_call", "inlineable")  # of what is compiled apart for a CPU
@@ -37,7 +37,7 @@ def programs():
     """Functions and their arguments, by name."""
     dataset = make_dataset()
     state = initial_state(dataset, CONFIG)
-    batch = jax.tree.map(lambda x: jnp.asarray(x, float), engine.load_batch(dataset.train, np.array([0, 3])))
+    batch = batch_of(dataset.train, [0, 3])
     step = lambda state, batch: train_step(state, batch, CONFIG, moving=True, pair_capacity=4096)
     cameras = jax.tree.map(lambda x: jnp.asarray(x, float)[None], select_camera(dataset.train.cameras, 0))
     shape = {"moving": True, "sh_degree": 1, "pair_capacity": 4096}

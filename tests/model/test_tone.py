@@ -5,9 +5,10 @@ import itertools
 import numpy as np
 import pytest
 from skimage.color import rgb2xyz, xyz2rgb
+from skimage.transform import resize
 
 from l2dgs_jax.data.color import linear_to_srgb, srgb_to_linear
-from l2dgs_jax.model.tone import darkening
+from l2dgs_jax.model.tone import darkening, recognise
 
 
 def test_transfer_functions_are_inverse_and_agree_with_scikit_image():
@@ -40,3 +41,50 @@ def test_a_bright_image_is_left_almost_as_it_is():
     law = darkening(0.5, 0.46)
     assert law.exponent == pytest.approx(1.01)
     assert law.gain == pytest.approx(1.0, abs=0.02)
+
+
+def test_a_gain_is_a_law_of_the_least_exponent():
+    exponent, gain = darkening(0.07, 0.46, "gain")
+    assert exponent == pytest.approx(1.01)
+    assert gain * 0.46**exponent == pytest.approx(0.07)
+
+
+@pytest.mark.parametrize("exponent", [1.2, 1.9])
+def test_an_exponent_is_taken_as_given(exponent):
+    law = darkening(0.07, 0.46, exponent)
+    assert law.exponent == exponent
+    assert law.gain * 0.46**exponent == pytest.approx(0.07)
+
+
+def photographs(contrast):
+    """Smooth pictures with the log-contrast of ordinary ones, sRGB."""
+    rng = np.random.default_rng(7)
+    coarse = rng.normal(0, 1, (3, 6, 8))
+    smooth = np.stack([resize(frame, (96, 128), order=3, mode="edge") for frame in coarse])
+    return np.clip(0.4 * np.exp(contrast * smooth / smooth.std()), 0, 0.98)[..., None].repeat(3, -1)
+
+
+def eight_bits(image):
+    return (np.round(255 * np.clip(image, 0, 1)) / 255).astype(np.float16)
+
+
+def test_clean_flat_frames_were_darkened_by_a_gain():
+    well = photographs(contrast=0.4)
+    assert recognise(eight_bits(0.16 * well)) == "gain"
+
+
+def test_noise_or_contrast_tell_little_light():
+    well, rng = photographs(contrast=0.4), np.random.default_rng(8)
+    dim = linear_to_srgb(0.03 * srgb_to_linear(well))
+    assert recognise(eight_bits(dim)) == "linear-light"
+    noisy = 0.16 * well + rng.normal(0, 0.01, well.shape)
+    assert recognise(eight_bits(noisy)) == "linear-light"
+
+
+def test_only_pixels_that_count_tell():
+    frames = eight_bits(0.16 * photographs(contrast=0.4))
+    frames[:, :, 64:] = np.random.default_rng(9).uniform(0, 1, (3, 96, 64, 3))
+    valid = np.ones(frames.shape[:3], bool)
+    assert recognise(frames, valid) == "linear-light"
+    valid[:, :, 56:] = False
+    assert recognise(frames, valid) == "gain"

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from planar_video import HEIGHT, WIDTH, video
 
+from l2dgs_jax.cameras.flow import LOST, match
 from l2dgs_jax.errors import UserError
-from l2dgs_jax.preprocess.flow import LOST, match
 from l2dgs_jax.preprocess.motion_masks.detection import moving_masks, partners, segmented
 from l2dgs_jax.types import Camera
 

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from tiny_training import FRAMES, HEIGHT, WIDTH, assert_equal_states, finish, make_dataset, state_of, tiny
+from tiny_training import FRAMES, HEIGHT, WIDTH, assert_equal_states, batch_of, finish, make_dataset, state_of, tiny
 
 from l2dgs_jax.config import DensityConfig
 from l2dgs_jax.model.rendering import Renderer
@@ -14,6 +14,7 @@ from l2dgs_jax.runs import checkpoints
 from l2dgs_jax.runs.checkpoints import Checkpoint
 from l2dgs_jax.runtime.capacity import next_capacity
 from l2dgs_jax.training import engine, initial_state, step
+from l2dgs_jax.training.batching import load_batch
 from l2dgs_jax.types import Camera
 
 
@@ -42,8 +43,7 @@ def objective_of(dataset, config, moving):
     params = treedef.unflatten([jitter(x, key) for key, x in enumerate(leaves)])
     # With random weights, OCD-Net's last ReLU may start dead, and the objective would not depend on it.
     params = params._replace(ocd=params.ocd._replace(out=params.ocd.out._replace(bias=params.ocd.out.bias + 1)))
-    batch = engine.load_batch(dataset.train, np.array([1, 4]))
-    batch = jax.tree.map(lambda x: jnp.asarray(x, float), batch)
+    batch = batch_of(dataset.train, [1, 4])
     probe = jnp.zeros((2, state.scene.alive.shape[0], 2))
 
     def value(params, probe):
@@ -111,7 +111,7 @@ def test_nothing_is_learned_from_pixels_that_do_not_count(dataset):
         images = np.where(valid[..., None], dataset.train.images, wrong).astype(np.float16)
         split = dataclasses.replace(dataset.train, images=images, valid=valid)
         states.append(initial_state(dataclasses.replace(dataset, train=split), config))
-        batch = engine.load_batch(split, np.array([1, 4]))
+        batch = load_batch(split, np.array([1, 4]))
         batch = batch._replace(images=jnp.asarray(batch.images, float))
         targets.append(step.targets(batch, estimate))
         assert jnp.all(jax.grad(lambda x, batch=batch: step.targets(batch, x)[0].sum())(estimate) == 0)
@@ -127,7 +127,7 @@ def test_a_step_takes_a_mask_of_pixels_that_count(dataset):
     config = tiny()
     state = initial_state(dataset, config)
     probe = jnp.zeros((2, state.scene.alive.shape[0], 2))
-    batch = jax.tree.map(lambda x: jnp.asarray(x, float), engine.load_batch(dataset.train, np.array([1, 4])))
+    batch = batch_of(dataset.train, [1, 4])
     half = jnp.arange(WIDTH) < WIDTH // 2
     report = jax.jit(
         lambda valid: step.objective(
@@ -213,7 +213,7 @@ def test_a_step_with_a_nan_changes_nothing_and_stops_the_run(dataset):
     images = dataset.train.images.copy()
     images[:, 0, 0] = np.nan
     state = initial_state(dataset, config)
-    batch = engine.load_batch(dataclasses.replace(dataset.train, images=images), np.array([0, 1]))
+    batch = load_batch(dataclasses.replace(dataset.train, images=images), np.array([0, 1]))
     after, report = train_step(state, batch, config, moving=False)
     assert not report.finite
     assert_equal_states(after, state)
@@ -225,7 +225,7 @@ def test_vmap_over_scenes_equals_a_loop(dataset):
     config = tiny()
     datasets = [dataset, make_dataset(1)]
     states = [initial_state(d, config) for d in datasets]
-    batches = [engine.load_batch(d.train, np.array([0, 3])) for d in datasets]
+    batches = [load_batch(d.train, np.array([0, 3])) for d in datasets]
     stack = lambda trees: jax.tree.map(lambda *x: jnp.stack([jnp.asarray(v) for v in x]), *trees)
     take = lambda state, batch: train_step(state, batch, config, moving=True)
     together, reports = jax.vmap(take)(stack(states), stack(batches))

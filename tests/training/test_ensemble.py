@@ -12,6 +12,7 @@ from tiny_training import FRAMES, HEIGHT, WIDTH, make_dataset, tiny
 from l2dgs_jax.config import Config, DensityConfig, overrides
 from l2dgs_jax.runtime import devices
 from l2dgs_jax.training import engine, initial_state, step
+from l2dgs_jax.training.batching import load_batch
 
 STEPS, CAPACITY = 8, 1024
 # Fine stage only, growing after the steps 3 and 6: every program takes long to compile.
@@ -140,7 +141,7 @@ def test_a_small_pair_buffer_grows_for_all(members, alone):
 def test_every_setting_that_members_may_differ_in_can_be_traced(forms):
     """A step whose numbers are traced is the step whose numbers are compiled in."""
     one = member(0, {"loss.amplification": 0.02, "loss.gate": 0.03, "optim.decay_steps": 7} | forms)
-    config, batch = one.config, engine.load_batch(one.split, np.array([0, 3]))
+    config, batch = one.config, load_batch(one.split, np.array([0, 3]))
     values = {
         name: jax.tree.map(jnp.asarray, value)
         for name, (value, _) in overrides.differences([config, _all_changed(config)]).items()

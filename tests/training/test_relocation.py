@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from tiny_training import make_dataset, tiny
+from tiny_training import batch_of, make_dataset, tiny
 
 from l2dgs_jax.rasterizer import rasterize
 from l2dgs_jax.training import engine, initial_state
@@ -162,7 +162,7 @@ def test_noise_is_wired_to_its_strength_and_fades_with_the_learning_rate():
     dataset, config = make_dataset(), growing()
     faint = dataclasses.replace(config, model=dataclasses.replace(config.model, initial_opacity=0.004))
     state = initial_state(dataset, faint)
-    batch = jax.tree.map(lambda x: jnp.asarray(x, float), engine.load_batch(dataset.train, np.array([0, 3])))
+    batch = batch_of(dataset.train, [0, 3])
 
     @jax.jit
     def centres(noise, schedule):

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from tiny_training import make_dataset, tiny
+from tiny_training import batch_of, make_dataset, tiny
 
 from l2dgs_jax.config import DensityConfig, overrides
 from l2dgs_jax.config.settings import RATE_GROUPS
@@ -30,10 +30,6 @@ def config_of(**changes):
     return overrides.replace(tiny(coarse_steps=COARSE, fine_steps=FINE, sh_warmup=4), changes)
 
 
-def batch_of(dataset):
-    return jax.tree.map(lambda x: jnp.asarray(x, float), engine.load_batch(dataset.train, np.array([0, 3])))
-
-
 def passed_on(dataset, monkeypatch, config, moving):
     """A function of a step's number: the exponent of Eq. 10, the target of B1's prior and the SH bands that it uses."""
     seen = {}
@@ -49,7 +45,7 @@ def passed_on(dataset, monkeypatch, config, moving):
 
     monkeypatch.setattr(step, "render", spy_on_render)
     monkeypatch.setattr(step.losses, "total", spy_on_total)
-    state, batch = initial_state(dataset, config), batch_of(dataset)
+    state, batch = initial_state(dataset, config), batch_of(dataset.train, [0, 3])
     probe = jnp.zeros((2, len(state.scene.alive), 2))
 
     @jax.jit
@@ -93,7 +89,7 @@ def test_the_prior_of_the_exponent_pulls_to_its_start(dataset, monkeypatch, expo
 
 def test_the_planes_are_smoothed_in_the_fine_stage_only(dataset):
     weights = {"loss.plane_smoothness": 2.0, "loss.time_smoothness": 3.0, "loss.time_l1": 5.0}
-    config, batch = config_of(**weights), batch_of(dataset)
+    config, batch = config_of(**weights), batch_of(dataset.train, [0, 3])
     state = initial_state(dataset, config)
     planes = jax.tree.map(lambda x: jax.random.normal(jax.random.key(0), x.shape), state.scene.params.hexplane)
     params = state.scene.params._replace(hexplane=planes)
@@ -190,7 +186,7 @@ def test_the_optimizer_starts_anew_with_the_fine_stage_and_not_when_a_run_goes_o
 @pytest.mark.slow
 def test_every_rate_moves_its_parameters_and_no_others(dataset):
     config = config_of(**{"model.motion_gate": True})
-    state, batch = initial_state(dataset, config), batch_of(dataset)
+    state, batch = initial_state(dataset, config), batch_of(dataset.train, [0, 3])
     leaves, treedef = jax.tree.flatten(state.scene.params)
     keys = jax.random.split(jax.random.key(0), len(leaves))
     leaves = [x + 0.03 * jax.random.normal(key, x.shape) for x, key in zip(leaves, keys, strict=True)]
@@ -228,7 +224,7 @@ def test_weights_on_sizes_and_the_gate(dataset):
         "scale": mean(jnp.exp(gaussians.log_scales).mean(-1)) / float(state.scene.extent),
         "gate": mean(jax.nn.sigmoid(gaussians.gate)),
     }
-    batch, probe = batch_of(dataset), jnp.zeros((2, len(state.scene.alive), 2))
+    batch, probe = batch_of(dataset.train, [0, 3]), jnp.zeros((2, len(state.scene.alive), 2))
 
     @partial(jax.jit, static_argnums=1)
     def loss(weights, moving):

@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
+from l2dgs_jax.cameras.flow import match, optical_flow
 from l2dgs_jax.preprocess.capture.frames import shrink
-from l2dgs_jax.preprocess.flow import match, optical_flow
 
 WORKING_SIZE = 512  # longer side of the pictures that flow is computed on, pixels
 NEIGHBOURS = (2, 4)  # how many frames before and after each one those are that it is compared with

@@ -85,6 +85,13 @@ def analytic_darkener(sample: Float32[np.ndarray, " N"], exposure: float) -> Dar
     return lambda light, _: scale * light + (1 - scale) * light**HIGHLIGHT_POWER
 
 
+def scale_light(image: Image, factor: float) -> Image:
+    """The picture with `factor` times the light, sRGB in [0, 1]: 1 leaves it exactly as it is."""
+    if factor == 1:
+        return image
+    return linear_to_srgb(np.clip(factor * srgb_to_linear(image), 0, 1)).astype(np.float32)
+
+
 def add_sensor_noise(image: Image, seed: tuple[int, ...], photons: float, read_noise: float) -> Image:
     """Photon (Poisson) and read-out (Gaussian) noise of a sensor that sees linear light.
 

@@ -23,6 +23,7 @@ Bytes = UInt8[np.ndarray, "H W 3"]
 
 
 MOST = 1e9  # electrons
+DRIFT_WAVES = 1.5  # of exposure while a video lasts
 SAMPLE = 1_000_000  # pixels of a video that the analytic curve is fitted to
 
 
@@ -36,6 +37,7 @@ class DarkeningConfig:
         exposure: mean lightness of the dark frames, saturated pixels aside; drawn from the range if not given.
         exposure_range: lowest and highest exposure to draw (LEDNet: 0.05 0.3).
         per_image: draw an exposure for every frame, which makes videos flicker, instead of one for all.
+        exposure_drift: share by which the light that the camera gathers swells and fades while it films.
         photons: electrons that white stands for; gives the sensor noise if set.
         read_noise: of that sensor, in electrons.
         lab_order: lightness as it should be, or with red and blue swapped as in LEDNet's script.
@@ -48,6 +50,7 @@ class DarkeningConfig:
     exposure: float | None = None
     exposure_range: tuple[float, float] = (0.05, 0.08)
     per_image: bool = False
+    exposure_drift: float = 0.0
     photons: float | None = None
     read_noise: float = 2.0
     lab_order: darkening.LabOrder = "correct"
@@ -66,6 +69,8 @@ class DarkeningConfig:
             raise UserError(
                 f"{name}: is {low:g} ... {high:g}; expected mean lightnesses between 0 (black) and 1 (white)"
             )
+        if not 0 <= self.exposure_drift < 1:
+            raise UserError(f"--exposure-drift {self.exposure_drift:g}: expected a share from 0, below 1")
         if self.weights is not None and self.method != "network":
             raise UserError("--weights: go with --method network; expected that method, or no weights")
         if self.photons is not None and not (0 < self.photons <= MOST and 0 <= self.read_noise <= MOST):
@@ -79,12 +84,14 @@ class FrameReport(NamedTuple):
 
     Attributes:
         exposure: that was asked for.
+        light: factor on the light by which this frame departs from it.
         psnr: dB, of the dark frame against the well-lit one; None if they are equal.
         level: mean sRGB value of the dark frame.
         welllit_level: of the well-lit one.
     """
 
     exposure: float
+    light: float
     psnr: float | None
     level: float
     welllit_level: float
@@ -100,20 +107,21 @@ def darken(dataset: Dataset, cfg: DarkeningConfig) -> tuple[Dataset, dict[str, F
     """
     names = dataset.train.names + dataset.test.names
     pictures = [to_bytes(picture) for picture in _sources(dataset)]
-    exposures = _exposures(len(names), cfg)
+    exposures, lights = _exposures(len(names), cfg), _lights(dataset, cfg)
     darkener = _darkener(pictures, _counted(dataset), exposures, dataset.name, cfg)
     frames: dict[str, FrameReport] = {}
     dark: list[Bytes] = []
     for i, name in enumerate(tqdm(names, desc="darken", unit="frame", dynamic_ncols=True)):
         image = _floats(pictures[i])
         low = darkening.darken(image, exposures[i], darkener(i), cfg.lab_order, cfg.allow_brightening)
+        low = darkening.scale_light(low, lights[i])
         if cfg.photons is not None:
             low = darkening.add_sensor_noise(low, (cfg.seed, i), cfg.photons, cfg.read_noise)
         dark.append(darkening.truncate(low))
         low = _floats(dark[i])
         psnr = float(metrics.psnr(jnp.asarray(low), jnp.asarray(image)))
         finite = psnr if math.isfinite(psnr) else None
-        frames[name] = FrameReport(exposures[i], finite, float(low.mean()), float(image.mean()))
+        frames[name] = FrameReport(exposures[i], lights[i], finite, float(low.mean()), float(image.mean()))
 
     first = len(dataset.train.names)
     return dataclasses.replace(
@@ -163,6 +171,13 @@ def _exposures(count: int, cfg: DarkeningConfig) -> list[float]:
         return [cfg.exposure] * count
     drawn = np.random.default_rng(cfg.seed).uniform(*cfg.exposure_range, count)
     return drawn.tolist() if cfg.per_image else [float(drawn[0])] * count
+
+
+def _lights(dataset: Dataset, cfg: DarkeningConfig) -> list[float]:
+    """Factors on the light of all frames: a wave in time, begun at random."""
+    times = np.concatenate([split.cameras.time for split in (dataset.train, dataset.test)])
+    begin = np.random.default_rng((cfg.seed, 1)).uniform()
+    return (1 + cfg.exposure_drift * np.sin(2 * np.pi * (begin + DRIFT_WAVES * times))).tolist()
 
 
 def _darkener(

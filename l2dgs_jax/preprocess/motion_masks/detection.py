@@ -14,8 +14,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
 from l2dgs_jax.cameras.epipolar import EpipolarGeometry, epipolar_geometry, project, static_residuals
+from l2dgs_jax.cameras.flow import LOST, Matches, brightened, match, optical_flow
 from l2dgs_jax.errors import UserError
-from l2dgs_jax.preprocess.flow import LOST, Matches, brightened, match, optical_flow
 from l2dgs_jax.types import Camera
 
 GAPS = ((1, 1), (2, 3), (4, 6), (7, 12))  # instants between matched frames, from and to

@@ -11,12 +11,12 @@ import numpy as np
 from jaxtyping import Bool, UInt8
 from tqdm import tqdm
 
+from l2dgs_jax.cameras.flow import brightened
 from l2dgs_jax.data.dataset import Dataset, Original
 from l2dgs_jax.data.images import to_bytes, write_image
 from l2dgs_jax.data.lens import distorted
 from l2dgs_jax.data.stacks import MappedArray, stacked
 from l2dgs_jax.errors import UserError
-from l2dgs_jax.preprocess.flow import brightened
 from l2dgs_jax.preprocess.motion_masks.detection import moving_masks
 from l2dgs_jax.types import Camera
 from l2dgs_jax.visualize.sheet import sheet

@@ -1,0 +1,84 @@
+"""What the frames show at the points."""
+
+import numpy as np
+import pytest
+
+from l2dgs_jax.model import observation
+from l2dgs_jax.types import Camera
+
+POINTS = np.random.default_rng(0).uniform([-1, -1, 2], [1, 1, 4], (20, 3)).astype(np.float32)
+
+
+def cameras(centres):
+    viewmat = np.tile(np.eye(4), (len(centres), 1, 1))
+    viewmat[:, :3, 3] = -np.asarray(centres)
+    K = np.tile(np.array([[10.0, 0, 8], [0, 10, 6], [0, 0, 1]]), (len(centres), 1, 1))
+    return Camera(viewmat, K, np.linspace(0, 1, len(centres)))
+
+
+def test_observed_colors_are_those_of_the_pixels_that_points_project_to():
+    images = np.random.default_rng(3).uniform(size=(4, 12, 16, 3))
+    images[1:] = images[:1]
+    still = cameras([[0, 0, 0]] * 4)
+    point_in_pixel = lambda column, row, z: [(column + 0.5 - 8) / 10 * z, (row + 0.5 - 6) / 10 * z, z]
+    points = np.array([point_in_pixel(3, 5, 2.0), point_in_pixel(15, 11, 3.0), [0, 0, -1], [100, 0, 1]])
+    colors = observation.observed_colors(points, still, images)
+    np.testing.assert_allclose(colors[0], images[0, 5, 3], rtol=1e-6)
+    np.testing.assert_allclose(colors[1], images[0, 11, 15], rtol=1e-6)
+    np.testing.assert_allclose(colors[2:], np.tile(images.mean((0, 1, 2)), (2, 1)), rtol=1e-6)
+
+
+def test_observed_colors_take_the_median_over_frames():
+    images = np.zeros((3, 12, 16, 3))
+    images[:] = np.array([0.1, 0.2, 0.9])[:, None, None, None]
+    colors = observation.observed_colors(np.array([[0, 0, 2.0]]), cameras([[0, 0, 0]] * 3), images)
+    np.testing.assert_allclose(colors, 0.2, rtol=1e-6)
+
+
+@pytest.mark.parametrize("at_once", [observation.SEEN_AT_ONCE, 40])
+def test_observed_colors_are_the_same_when_few_are_held_at_once(monkeypatch, at_once):
+    rng = np.random.default_rng(4)
+    images, valid = rng.uniform(size=(7, 12, 16, 3)).astype(np.float16), rng.random((7, 12, 16)) < 0.6
+    spread = cameras(rng.uniform([-2, -1, -2], [2, 1, 3], (7, 3)))
+    monkeypatch.setattr(observation, "SEEN_AT_ONCE", at_once)
+    colors = observation.observed_colors(POINTS, spread, images, valid)
+
+    local = np.einsum("fij,pj->fpi", spread.viewmat[:, :3, :3], POINTS) + spread.viewmat[:, None, :3, 3]
+    pixels = np.floor(np.einsum("fij,fpj->fpi", spread.K, local) / np.where(local[..., 2:] > 0, local[..., 2:], np.inf))
+    mean = images.mean((0, 1, 2), np.float64, where=valid[..., None]).astype(np.float32)
+    some_seen = 0
+    for point, color in enumerate(colors):
+        seen = [
+            images[frame, int(row), int(column)].astype(np.float32)
+            for frame, (column, row, _) in enumerate(pixels[:, point])
+            if local[frame, point, 2] > 0
+            and (0 <= column < 16 and 0 <= row < 12)
+            and valid[frame, int(row), int(column)]
+        ]
+        some_seen += len(seen) > 1
+        np.testing.assert_array_equal(color, np.median(seen, axis=0) if seen else mean)
+    assert 5 < some_seen < len(POINTS)
+
+
+def wall(frames, gains):
+    """A textured wall that the camera sees from the same place in every frame, exposed differently."""
+    texture = np.random.default_rng(5).uniform(0.1, 0.4, (12, 16, 3))
+    return np.exp(gains)[:, None, None] * np.tile(texture, (frames, 1, 1, 1))
+
+
+def test_exposures_are_the_gains_of_the_frames():
+    rng = np.random.default_rng(6)
+    gains = rng.uniform(-0.3, 0.3, (9, 3))
+    images = wall(9, gains)
+    images[:, 2:5, 3:7] = rng.uniform(0.1, 0.4, (9, 3, 4, 3))  # something else moves
+    found = observation.exposures(POINTS, cameras([[0, 0, 0]] * 9), images)
+    np.testing.assert_allclose(found, gains - gains.mean(0), atol=0.02)
+    np.testing.assert_allclose(found.mean(0), 0, atol=1e-6)
+
+
+def test_frames_that_tell_nothing_of_their_exposure_have_none():
+    images, valid = wall(4, np.full((4, 3), 0.1)), np.ones((4, 12, 16), bool)
+    images[2] *= 1.4
+    valid[2] = False
+    np.testing.assert_allclose(observation.exposures(POINTS, cameras([[0, 0, 0]] * 4), images, valid), 0, atol=1e-6)
+    assert not observation.exposures(POINTS - [0, 0, 9], cameras([[0, 0, 0]] * 4), images).any()

@@ -1,0 +1,44 @@
+"""What `train` warns of."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from tiny_training import make_dataset, tiny
+
+from l2dgs_jax.config import DensityConfig
+from l2dgs_jax.runs.advice import FEW_FRAMES, FEW_POINTS, misfit
+
+GROWING, FIXED = DensityConfig(start=1, stop=100), DensityConfig(start=1, stop=0)
+
+
+def dataset_of(frames=FEW_FRAMES, points=FEW_POINTS, size=(400, 225)):
+    dataset = make_dataset()
+    train = dataclasses.replace(dataset.train, names=tuple(map(str, range(frames))))
+    return dataclasses.replace(dataset, train=train, points=np.zeros((points, 3)), width=size[0], height=size[1])
+
+
+def test_a_scene_that_suits_its_settings_needs_no_words():
+    assert misfit(dataset_of(), tiny(density=FIXED)) is None
+
+
+@pytest.mark.parametrize(
+    ("dataset", "density", "words"),
+    [
+        (dataset_of(size=(1920, 1080)), GROWING, ["1920x1080", "23 times", "--downscale 3"]),
+        (dataset_of(frames=5), GROWING, ["5 frames"]),
+        (dataset_of(points=20), FIXED, ["20 points", "--density.stop"]),
+    ],
+)
+def test_what_does_not_fit_is_said_in_one_line(dataset, density, words):
+    warning = misfit(dataset, tiny(density=density))
+    assert all(word in warning for word in words)
+    assert "\n" not in warning
+
+
+def test_points_that_are_added_need_not_be_there_at_first():
+    assert misfit(dataset_of(points=20), tiny(density=GROWING)) is None
+
+
+def test_a_larger_factor_starts_from_the_one_in_use():
+    assert "--downscale 4" in misfit(dataset_of(size=(960, 540)), tiny(density=FIXED, downscale=2))

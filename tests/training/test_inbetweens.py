@@ -1,0 +1,155 @@
+"""Views between frames: against what a moving texture really looks like there."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from tiny_training import assert_equal_states, finish, make_dataset, state_of, tiny
+
+from l2dgs_jax.cameras.geometry import between, camera_centres
+from l2dgs_jax.data import Split
+from l2dgs_jax.training import engine, initial_state
+from l2dgs_jax.training.batching import load_batch, next_batch, view_indices
+from l2dgs_jax.training.inbetweens import draw, neighbour_flows
+from l2dgs_jax.types import Camera
+
+WIDTH, HEIGHT, FRAMES, SPEED = 96, 64, 5, 5.0  # pixels a frame
+PATCH = slice(20, 44), slice(30, 60)
+
+
+def texture(columns, rows):
+    """Smooth, with detail in every direction, dark, sRGB."""
+    waves = [(0.31, 0.13), (-0.17, 0.29), (0.43, -0.37), (0.11, 0.07), (-0.53, 0.41)]
+    value = sum(np.sin(a * columns + b * rows + i) for i, (a, b) in enumerate(waves))
+    return (0.1 + 0.015 * value)[..., None] * [1.0, 0.9, 0.8]
+
+
+def picture(time):
+    """What is seen `time` frames after the first: everything moves to the right."""
+    columns, rows = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
+    return texture(columns - SPEED * time, rows)
+
+
+@pytest.fixture(scope="module")
+def split():
+    viewmat = np.tile(np.eye(4, dtype=np.float32), (FRAMES, 1, 1))
+    viewmat[:, 0, 3] = -0.1 * np.arange(FRAMES)
+    intrinsics = np.tile(np.array([[80, 0, 48], [0, 80, 32], [0, 0, 1]], np.float32), (FRAMES, 1, 1))
+    order = np.array([2, 0, 4, 1, 3])  # frames need not come in the order of time
+    cameras = Camera(viewmat[order], intrinsics, (order / (FRAMES - 1)).astype(np.float32))
+    images = np.stack([picture(time) for time in order]).astype(np.float16)
+    return Split(tuple(map(str, order)), cameras, images)
+
+
+@pytest.fixture(scope="module")
+def flows(split):
+    return neighbour_flows(split)
+
+
+def test_frames_follow_each_other_in_time(flows):
+    np.testing.assert_array_equal(flows.following, [4, 3, 2, 0, 2])  # the last one has none to follow it
+
+
+@pytest.mark.parametrize("part", [0.25, 0.5, 0.8])
+def test_a_view_between_two_frames_shows_what_is_there(split, flows, part):
+    view = draw(split, flows, frame=3, part=part)  # the second in time
+    truth = picture(1 + part)
+    inner = np.zeros((HEIGHT, WIDTH), bool)
+    inner[8:-8, 16:-16] = True
+    assert view.valid[inner].mean() > 0.9
+    counted = view.valid & inner
+    error = np.abs(view.image.astype(float) - truth)[counted].mean()
+    faded = (1 - part) * picture(1) + part * picture(2)
+    assert error < 0.2 * np.abs(faded - truth)[counted].mean()
+    np.testing.assert_allclose(view.camera.time, (1 + part) / (FRAMES - 1), rtol=1e-6)
+    np.testing.assert_allclose(view.camera.viewmat[0, 3], -0.1 * (1 + part), rtol=1e-5)
+
+
+def test_what_only_one_frame_shows_is_left_out(split):
+    images = split.images.copy()
+    images[3][PATCH] = 0.4
+    view = draw(dataclasses.replace(split, images=images), neighbour_flows(split), frame=3, part=0.5)
+    moved = slice(20, 44), slice(34, 60)  # where both the patch and what it should be come to lie
+    assert view.valid[moved].mean() < 0.1
+    assert view.valid[:16].mean() > 0.7
+    assert not view.image[~view.valid].any()
+
+
+def test_pixels_that_are_not_valid_stay_so(split, flows):
+    valid = np.ones(split.images.shape[:3], bool)
+    valid[3, :, 40:50] = False
+    view = draw(dataclasses.replace(split, valid=valid), flows, frame=3, part=0.5)
+    assert not view.valid[:, 43:48].any()
+    assert view.valid[:, 20:36].mean() > 0.7
+
+
+def test_of_several_cameras_the_nearest_one_follows():
+    cameras = make_dataset().train.cameras
+    rig = Camera(*(np.concatenate([x, x]) for x in cameras))
+    rig.viewmat[6:, 1, 3] += 5
+    images = np.zeros((12, 24, 32, 3), np.float16)
+    following = neighbour_flows(Split(tuple("abcdefghijkl"), rig, images)).following
+    np.testing.assert_array_equal(following, [1, 2, 3, 4, 5, 5, 7, 8, 9, 10, 11, 11])
+
+
+def test_frames_that_do_not_match_are_not_mixed():
+    noise = np.random.default_rng(0).uniform(0, 0.3, (FRAMES, HEIGHT, WIDTH, 3)).astype(np.float16)
+    cameras = Camera(*(x[:FRAMES] for x in make_dataset().train.cameras))
+    np.testing.assert_array_equal(neighbour_flows(Split(tuple("abcde"), cameras, noise)).following, range(FRAMES))
+
+
+def test_cameras_between_cameras():
+    rotations = Rotation.from_euler("y", [[0], [40]], degrees=True).as_matrix()
+    viewmat = np.tile(np.eye(4), (2, 1, 1))
+    viewmat[:, :3, :3] = rotations
+    viewmat[:, :3, 3] = -np.einsum("fij,fj->fi", rotations, [[0, 0, 0], [1, 2, 3]])
+    cameras = Camera(viewmat, np.stack([np.diag([10.0, 10, 1]), np.diag([20.0, 20, 1])]), np.array([0.2, 0.6]))
+    middle = between(cameras, 0, 1, 0.25)
+    np.testing.assert_allclose(camera_centres(middle.viewmat), [0.25, 0.5, 0.75], atol=1e-12)
+    np.testing.assert_allclose(
+        Rotation.from_matrix(middle.viewmat[:3, :3]).as_euler("yxz", True), [10, 0, 0], atol=1e-9
+    )
+    np.testing.assert_allclose(middle.K[0, 0], 12.5)
+    np.testing.assert_allclose(middle.time, 0.3)
+    for end in (0, 1):
+        for x, y in zip(between(cameras, 0, 1, float(end)), (x[end] for x in cameras), strict=True):
+            np.testing.assert_allclose(x, y, atol=1e-12)
+
+
+def test_batches_mix_frames_and_views_between_them(split, flows):
+    config = tiny(inbetweens=0.5, batch_size=2)
+    kinds = []
+    for step in range(40):
+        batch = next_batch(split, config, step, flows)
+        again = next_batch(split, config, step, flows)
+        jax.tree.map(np.testing.assert_array_equal, batch, again)
+        for row, frame in enumerate(view_indices(config.seed, step, 2, FRAMES)):
+            plain = load_batch(split, np.array([frame]))
+            is_frame = bool(batch.cameras.time[row] == plain.cameras.time[0])
+            kinds.append(is_frame)
+            assert batch.frames[row] == frame
+            if is_frame:
+                np.testing.assert_array_equal(batch.images[row], plain.images[0])
+                assert batch.valid[row].all()
+            else:
+                assert 0 <= batch.cameras.time[row] - plain.cameras.time[0] <= 1 / (FRAMES - 1) + 1e-6
+                assert not batch.valid[row].all()
+    # Of five frames the last has none to follow it.
+    assert 0.4 < np.mean(kinds) < 0.8
+
+
+def test_without_any_the_frames_are_all_there_is(split):
+    batch = next_batch(split, tiny(), 3, None)
+    np.testing.assert_array_equal(batch.images, split.images[batch.frames])
+    assert batch.valid is None
+
+
+def test_a_training_with_them_resumes_where_it_stopped():
+    dataset, config = make_dataset(), tiny(inbetweens=0.9, coarse_steps=0, fine_steps=4)
+    steps = engine.run([engine.Member(dataset.train, config, initial_state(dataset, config))])
+    states = [jax.device_get(state_of(progress)) for progress in steps]
+    resumed = state_of(finish(dataset, config, jax.tree.map(jnp.asarray, states[1])))
+    assert_equal_states(resumed, states[-1])
