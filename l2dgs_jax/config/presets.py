@@ -44,8 +44,7 @@ def _presets() -> dict[str, Config]:
     default = Config(
         coarse_steps=100,  # what moves is smeared in the coarse stage: no longer than geometry needs
         fine_steps=1500,
-        inbetweens=0.3,
-        sh_warmup=None,
+        inbetweens=0.2,
         model=ModelConfig(
             unit="depth",
             hidden=64,
@@ -55,7 +54,6 @@ def _presets() -> dict[str, Config]:
             reflectance_init="observed",
             initial_exponents=("auto", 9.0),
             initial_illumination="auto",
-            initial_opacity=0.3,
             tone="auto",
             exposure="auto",
         ),
@@ -79,7 +77,7 @@ def _presets() -> dict[str, Config]:
             ocd_lr=5e-5,
             decay_steps=2400,  # motion would end half learned if its rates fell to their end within the run
         ),
-        # Births that leave the image as it is; nothing dies, for what moves is faint before its motion is learned.
+        # Births leave the image as it is. Nothing is carried off: before its motion is learned, what moves is faint.
         density=DensityConfig(
             method="mcmc", start=100, stop=1000, interval=50, prune_opacity=0.0, max_gaussians="auto"
         ),
@@ -92,11 +90,12 @@ def _presets() -> dict[str, Config]:
         optim=dataclasses.replace(default.optim, decay_steps=7500),
         density=dataclasses.replace(default.density, stop=3000),
     )
-    # A smaller motion field and fewer steps.
+    # A smaller motion field and fewer steps, in which nothing is added.
     demo = dataclasses.replace(
         default,
-        coarse_steps=100,
-        fine_steps=300,
+        coarse_steps=150,
+        fine_steps=250,
+        sh_warmup=150,
         model=dataclasses.replace(default.model, plane_size=32, hidden=32),
         optim=dataclasses.replace(default.optim, decay_steps=None),
         density=dataclasses.replace(default.density, stop=0),

@@ -204,10 +204,10 @@ def test_every_rate_moves_its_parameters_and_no_others(dataset):
         assert moved == {name}
 
 
-def test_a_scene_without_a_gate_has_no_rate_for_it(dataset):
+def test_a_scene_without_gate_and_exposures_has_no_rates_for_them(dataset):
     """So that its checkpoints are those of versions before there was one."""
     rates = initial_state(dataset, config_of()).adam.schedules
-    assert rates.keys() == set(RATE_GROUPS) - {"gate"}
+    assert rates.keys() == set(RATE_GROUPS) - {"gate", "exposures"}
 
 
 def test_weights_on_sizes_and_the_gate(dataset):
