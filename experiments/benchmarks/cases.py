@@ -35,7 +35,11 @@ Figures = dict[str, float]
 DEFAULT = PRESETS["default"]
 # What `training.resolve` would take from the frames; it costs the same whatever they are.
 CONFIG = dataclasses.replace(
-    DEFAULT, model=dataclasses.replace(DEFAULT.model, initial_exponents=(2.0, 9.0), initial_illumination=0.9)
+    DEFAULT,
+    model=dataclasses.replace(
+        DEFAULT.model, initial_exponents=(2.0, 9.0), initial_illumination=0.9, tone=2.0, exposure="steady"
+    ),
+    density=dataclasses.replace(DEFAULT.density, stop=0),
 )
 SIZES = {"10k_160x96": (10_000, 160, 96), "50k_480x270": (50_000, 480, 270), "50k_800x450": (50_000, 800, 450)}
 STEPS = {"10k_200x112": (10_000, 200, 112), "40k_400x225": (40_000, 400, 225), "50k_800x450": (50_000, 800, 450)}

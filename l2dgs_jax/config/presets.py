@@ -44,7 +44,7 @@ def _presets() -> dict[str, Config]:
     default = Config(
         coarse_steps=100,  # what moves is smeared in the coarse stage: no longer than geometry needs
         fine_steps=1500,
-        inbetweens=0.2,
+        inbetweens=0.3,
         model=ModelConfig(
             unit="depth",
             hidden=64,
@@ -54,6 +54,7 @@ def _presets() -> dict[str, Config]:
             reflectance_init="observed",
             initial_exponents=("auto", 9.0),
             initial_illumination="auto",
+            initial_opacity=0.3,
             tone="auto",
             exposure="auto",
         ),
@@ -70,6 +71,7 @@ def _presets() -> dict[str, Config]:
         ),
         optim=OptimConfig(
             extent_scales=("means",),  # motion field and heads have no unit
+            illumination_lr=1e-3,
             reflectance_lr=5e-3,  # 1e-5 moves a reflectance by 0.03 in 3,000 steps
             attenuation_lr=5e-3,
             heads_lr=1.5e-3,

@@ -53,10 +53,9 @@ def initial_state(dataset: Dataset, config: Config) -> TrainState:
     order, train = z_order(dataset.points), dataset.train
     points, colors = dataset.points[order], None if dataset.colors is None else dataset.colors[order]
     capacity = len(points)
-    if config.density.method == "mcmc":
-        capacity = max(int(config.density.max_gaussians), capacity)
-    elif config.density.start < config.density.stop:
-        capacity = next_capacity(min(1.5 * capacity, max(int(config.density.max_gaussians), capacity)))
+    if config.density.start < config.density.stop:
+        most = max(int(config.density.max_gaussians), capacity)
+        capacity = most if config.density.method == "mcmc" else next_capacity(min(1.5 * capacity, most))
     reflectance = None
     if config.model.reflectance_init == "observed":
         law = split_darkening(train, config)
