@@ -43,7 +43,7 @@ def _presets() -> dict[str, Config]:
     )
     default = Config(
         coarse_steps=100,  # what moves is smeared in the coarse stage: no longer than geometry needs
-        fine_steps=1500,
+        fine_steps=1100,
         inbetweens=0.3,
         model=ModelConfig(
             unit="depth",
@@ -80,11 +80,9 @@ def _presets() -> dict[str, Config]:
             decay_steps=2400,  # motion would end half learned if its rates fell to their end within the run
         ),
         # Births leave the image as it is. Nothing is carried off: before its motion is learned, what moves is faint.
-        density=DensityConfig(
-            method="mcmc", start=100, stop=1000, interval=50, prune_opacity=0.0, max_gaussians="auto"
-        ),
+        density=DensityConfig(method="mcmc", start=100, stop=800, interval=50, prune_opacity=0.0, max_gaussians="auto"),
     )
-    fast = dataclasses.replace(default, fine_steps=700, density=dataclasses.replace(default.density, stop=500))
+    fast = dataclasses.replace(default, fine_steps=500, density=dataclasses.replace(default.density, stop=400))
     best = dataclasses.replace(
         default,
         fine_steps=4900,
