@@ -168,7 +168,7 @@ def presence(state: TrainState, config: Config) -> Float[Array, " N"] | None:
         return None
     share = config.drop * state.step.astype(state.stats.seen.dtype) / config.steps
     key = jax.random.fold_in(_key(state, config), 3)
-    return jax.random.bernoulli(key, 1 - share, state.scene.alive.shape) / (1 - share)
+    return jnp.where(jax.random.bernoulli(key, share, state.scene.alive.shape), 0, 1 / (1 - share))
 
 
 def exposed(

@@ -11,7 +11,7 @@ from l2dgs_jax.data import load_dataset
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.runs import Checkpoint, fit, open_run, save_run
 from l2dgs_jax.runtime import devices
-from l2dgs_jax.training import engine, initial_state
+from l2dgs_jax.training import engine, initial_state, resolve
 from l2dgs_jax.training.step import StepReport
 
 
@@ -42,7 +42,7 @@ def test_every_step_is_told_and_the_last_state_is_the_runs(dataset, quick):
 
 
 def test_a_training_goes_on_from_a_state(dataset, quick):
-    config = tiny(coarse_steps=2, fine_steps=3, density=PRESETS["default"].density)
+    config = resolve(tiny(coarse_steps=2, fine_steps=3, density=PRESETS["default"].density), dataset)
     state = initial_state(dataset, config)._replace(step=jnp.int32(4))
     seen = []
     assert fit(dataset, config, seen.append, start=Checkpoint(state, 2048)).state.step == 5
