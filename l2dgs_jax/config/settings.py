@@ -31,14 +31,12 @@ _PLAIN_NUMBER, _PLAIN_COUNT, _PLAIN_LENGTH = float, int, int | None
 _PLAIN_EXPONENTS = tuple[float | Literal["auto"], float] | None
 _PLAIN_MOST = int | Literal["auto"]
 _PLAIN_ILLUMINATION = float | Literal["auto"] | None
-_PLAIN_TONE = float | Literal["linear-light", "gain", "auto"]
 Number = Annotated[_Float, _arg(_PLAIN_NUMBER)]
 Count = Annotated[_Int, _arg(_PLAIN_COUNT)]
 Length = Annotated[_Int | None, _arg(_PLAIN_LENGTH)]
 Exponents = Annotated[tuple[_Float | Literal["auto"], _Float] | None, _arg(_PLAIN_EXPONENTS)]
 Most = Annotated[_Int | Literal["auto"], _arg(_PLAIN_MOST)]
 Illumination = Annotated[_Float | Literal["auto"] | None, _arg(_PLAIN_ILLUMINATION)]
-Tone = Annotated[_Float | Literal["linear-light", "gain", "auto"], _arg(_PLAIN_TONE)]
 TRACEABLE: dict[Any, Any] = {
     Number: _PLAIN_NUMBER,
     Count: _PLAIN_COUNT,
@@ -46,7 +44,6 @@ TRACEABLE: dict[Any, Any] = {
     Exponents: _PLAIN_EXPONENTS,
     Most: _PLAIN_MOST,
     Illumination: _PLAIN_ILLUMINATION,
-    Tone: _PLAIN_TONE,
 }
 
 EPS = math.exp(-5)  # of Eq. 10
@@ -99,7 +96,7 @@ class ModelConfig:
     initial_illumination: Illumination = None
     # How the frames became dark: "linear-light", by little light; "gain", by a factor on their sRGB values; "auto",
     # what they look like (model/tone.py); or a number, the exponent that B1 starts at where it is "auto"
-    tone: Tone = "linear-light"
+    tone: float | Literal["linear-light", "gain", "auto"] = "linear-light"
     initial_opacity: Number = 0.1  # of every Gaussian
     # Whether every training frame has a gain of its own, learned beside the scene; "auto": if the points say so
     exposure: Literal["steady", "drifting", "auto"] = "steady"

@@ -23,7 +23,7 @@ def split_darkening(split: Split, config: Config) -> Darkening:
     tone = config.model.tone
     if tone == "auto":
         tone = recognise(split.images, split.valid)
-    return darkening(split.mean_level, float(config.loss.exposure_level), tone)  # type: ignore[arg-type]
+    return darkening(split.mean_level, float(config.loss.exposure_level), tone)
 
 
 def resolve(config: Config, dataset: Dataset) -> Config:
