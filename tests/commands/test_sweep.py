@@ -22,8 +22,9 @@ preset = "default"
 coarse_steps = 6
 fine_steps = 6
 checkpoint_every = 2
-density = { start = 1, stop = 100, interval = 4, grad_threshold = 1e-7, max_gaussians = 80 }
-model = { plane_size = 4, plane_scales = [1], hidden = 8, sh_degree = 1 }
+inbetweens = 0
+density = { method = "adaptive", start = 1, stop = 100, interval = 4, grad_threshold = 1e-7, max_gaussians = 80 }
+model = { plane_size = 4, plane_scales = [1], hidden = 8, sh_degree = 1, exposure = "steady", tone = 1.5 }
 
 [[variants]]
 name = "usual"
