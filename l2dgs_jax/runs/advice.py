@@ -1,9 +1,12 @@
 """What a user should know before a long training."""
 
+import math
+
 from l2dgs_jax.config import Config
 from l2dgs_jax.data import Dataset
 
-MANY_PIXELS = 250_000  # of a frame, well above what presets are timed at
+USUAL_PIXELS = 90_000  # of a frame: 400x225
+MANY_PIXELS = 250_000
 FEW_POINTS = 500
 FEW_FRAMES = 8
 
@@ -12,12 +15,10 @@ def misfit(dataset: Dataset, config: Config) -> str | None:
     """One sentence on what in a scene does not suit the settings, the costliest first; None if all does."""
     pixels = dataset.width * dataset.height
     if pixels > MANY_PIXELS:
-        factor = 2
-        while pixels > factor**2 * MANY_PIXELS:
-            factor += 1
+        factor = math.ceil(math.sqrt(pixels / MANY_PIXELS))
         return (
-            f"frames of {dataset.width}x{dataset.height} take {pixels / 90_000:.0f} times as long as the 400x225 that "
-            f"presets are timed at; --downscale {factor * config.downscale} makes them smaller"
+            f"frames of {dataset.width}x{dataset.height} take about {pixels / USUAL_PIXELS:.0f} times as long as ones "
+            f"of 400x225; --downscale {factor * config.downscale} makes them smaller"
         )
     if len(dataset.train.names) < FEW_FRAMES:
         return f"{len(dataset.train.names)} frames are few to learn motion from; expect it to be coarse"

@@ -52,8 +52,7 @@ def evaluate(run: Run, split_name: str = "test") -> dict:
         """As its frame's camera exposed it, if exposures differ: nobody has told that of frames not trained on."""
         if not drifting:
             return estimate
-        counted = slice(None) if split.valid is None else split.valid[index]
-        return metrics.best_gain([(estimate[counted], split.images[index][counted])]) * estimate
+        return metrics.best_gain([_counted(estimate, split.images, split, index)]) * estimate
 
     def relit() -> Iterator[Float16[np.ndarray, "H W 3"]]:
         """The well-lit views, as compact as the data set's own; the low-light ones are scored on the way."""
@@ -117,7 +116,7 @@ def _with_gain(
 ) -> tuple[dict, dict, float]:
     """Scores per region without and with the one best gain, and that gain."""
     plain = [_compare(p, truths, split, i) for i, p in enumerate(predictions)]
-    gain = metrics.best_gain(_counted(predictions, truths, split))
+    gain = metrics.best_gain(_counted(p, truths, split, i) for i, p in enumerate(predictions))
     gained = [_compare(gain * p.astype(np.float32), truths, split, i) for i, p in enumerate(predictions)]
     after = metrics.summarise(gained)
     renamed = {region: {f"{key}_gain": value for key, value in means.items()} for region, means in after.items()}
@@ -125,12 +124,11 @@ def _with_gain(
 
 
 def _counted(
-    predictions: Float[np.ndarray, "F H W 3"], truths: Float[np.ndarray, "F H W 3"], split: Split
-) -> Iterator[tuple[Float[np.ndarray, "..."], Float[np.ndarray, "..."]]]:
-    """Prediction and truth of every frame where its pixels count."""
-    for index, prediction in enumerate(predictions):
-        counted = slice(None) if split.valid is None else split.valid[index]
-        yield prediction[counted], truths[index][counted]
+    prediction: Float[np.ndarray, "H W 3"], truths: Float[np.ndarray, "F H W 3"], split: Split, index: int
+) -> tuple[Float[np.ndarray, "..."], Float[np.ndarray, "..."]]:
+    """Prediction and truth of the frame `index` where its pixels count."""
+    counted = slice(None) if split.valid is None else split.valid[index]
+    return prediction[counted], truths[index][counted]
 
 
 def _compare(

@@ -7,23 +7,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cloud import POINTS, cameras
 
 from l2dgs_jax.config import ModelConfig
 from l2dgs_jax.model import initialisation
 from l2dgs_jax.model.initialisation import SH_DC
 from l2dgs_jax.runtime.capacity import next_capacity
 from l2dgs_jax.training.parameter_groups import groups
-from l2dgs_jax.types import Camera
 
 CFG = ModelConfig(plane_size=4, plane_scales=(1,), plane_channels=2, hidden=4, sh_degree=1)
-POINTS = np.random.default_rng(0).uniform([-1, -1, 2], [1, 1, 4], (20, 3)).astype(np.float32)
-
-
-def cameras(centres):
-    viewmat = np.tile(np.eye(4), (len(centres), 1, 1))
-    viewmat[:, :3, 3] = -np.asarray(centres)
-    K = np.tile(np.array([[10.0, 0, 8], [0, 10, 6], [0, 0, 1]]), (len(centres), 1, 1))
-    return Camera(viewmat, K, np.linspace(0, 1, len(centres)))
 
 
 CAMERAS = cameras([[-1, 0, 0], [1, 0, 0], [0, 0, 0], [0, 0, 0]])
