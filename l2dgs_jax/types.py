@@ -34,6 +34,8 @@ class Gaussians(NamedTuple):
         reflectance: r of Eq. 6.
         attenuation: brightness attenuation features (b1, b2) of Eq. 8.
         gate: how much of the motion field acts, before the sigmoid; None: all of it.
+        paths: displacements, as K control points of a cubic spline over [0, 1], world units; None: no Gaussian has one.
+        lifetimes: the first and the last instant at which a Gaussian with a path is there; infinite for those without.
     """
 
     means: Float[Array, "*B N 3"]
@@ -45,6 +47,8 @@ class Gaussians(NamedTuple):
     reflectance: Float[Array, "*B N 3"]
     attenuation: Float[Array, "*B N 2"]
     gate: Float[Array, "*B N"] | None = None
+    paths: Float[Array, "*B N K 3"] | None = None
+    lifetimes: Float[Array, "*B N 2"] | None = None
 
 
 class MovedGaussians(NamedTuple):

@@ -26,6 +26,7 @@ def tiny(preset="default", **changes):
         initial_exponents=exponents,
         initial_illumination=illumination,
         exposure="steady",
+        tracks=False,
         plane_size=4,
         plane_scales=(1, 2),
         plane_channels=2,

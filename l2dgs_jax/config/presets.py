@@ -47,6 +47,7 @@ def _presets() -> dict[str, Config]:
         inbetweens=0.3,
         model=ModelConfig(
             unit="depth",
+            tracks=True,
             hidden=64,
             plane_scales=(1, 2),
             opacity_head=True,  # a copy of what moves can fade where it does not belong
@@ -70,7 +71,7 @@ def _presets() -> dict[str, Config]:
             exponent_prior=0.2,
         ),
         optim=OptimConfig(
-            extent_scales=("means",),  # motion field and heads have no unit
+            extent_scales=("means", "paths"),  # motion field and heads have no unit
             illumination_lr=1e-3,
             reflectance_lr=5e-3,  # 1e-5 moves a reflectance by 0.03 in 3,000 steps
             attenuation_lr=5e-3,

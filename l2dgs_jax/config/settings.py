@@ -62,6 +62,8 @@ RATE_GROUPS = (
     "scales",
     "quats",
     "gate",
+    "paths",
+    "lifetimes",
     "exposures",
 )
 
@@ -85,6 +87,9 @@ class ModelConfig:
     hidden: int = 128  # width of g, of the heads and of OCD-Net
     opacity_head: bool = False  # a fourth head moves the opacity's logit, as 4DGS can (arXiv 2310.08528)
     motion_gate: bool = False  # a factor a Gaussian in (0, 1) on all that the motion field does to it
+    # Whether what moves starts as Gaussians with paths and lifetimes of their own, from tracks of optical flow
+    # (training/seeds.py); the motion field acts on top
+    tracks: bool = False
     identity_start: bool = False  # heads and OCD-Net start as "no motion, a_j = 1" instead of at random
     illumination_offset: Number = 0.5  # l = max(offset + sum a_j b_j B_j, 0)
     # N(0, 1), U(0, 1), or the frames' colours at the points, with the darkening of model/tone.py undone
@@ -162,6 +167,8 @@ class OptimConfig:
     scales_lr: Number = 5e-3
     quats_lr: Number = 1e-3
     gate_lr: Number = 0.01
+    paths_lr: Number = 1e-3
+    lifetimes_lr: Number = 0.0
     exposures_lr: Number = 1e-3
     decay_steps: Length = 20_000  # length of the decays; None: the length of the stage
     beta1: Number = 0.9

@@ -10,6 +10,8 @@ from l2dgs_jax.config import ModelConfig
 from l2dgs_jax.model import hexplane, networks, spherical_harmonics
 from l2dgs_jax.types import Camera, Gaussians, MovedGaussians, Scene
 
+FADING = 0.25  # time in which a Gaussian on a path comes or goes, over that between two control points
+
 
 def deform(
     scene: Scene,
@@ -28,7 +30,7 @@ def deform(
         scene: the scene; rows that are not alive come out with opacity 0, whatever their parameters.
         cameras: V cameras.
         cfg: shape of the scene.
-        moving: whether the motion field and OCD-Net act (fine stage); otherwise the canonical Gaussians, with a_j = 1.
+        moving: whether the motion field and OCD-Net act (fine stage); otherwise only paths do, with a_j = 1.
         sh_degree_active: bands of Eq. 2 above this one are left out; may be traced.
         presence: factor on the opacities, which stay at most 1; None for 1.
 
@@ -60,6 +62,9 @@ def deform(
             logit_opacities += motion.logit_opacities
         coefficients = factors * coefficients
     opacities = jnp.where(alive[None], jax.nn.sigmoid(logit_opacities), 0)
+    if gaussians.paths is not None and gaussians.lifetimes is not None:
+        displacements, there = _on_paths(gaussians.paths, gaussians.lifetimes, cameras.time)
+        means, opacities = means + displacements, there * opacities
     return MovedGaussians(
         means=means,
         quats=quats,
@@ -69,6 +74,32 @@ def deform(
         reflectance=per_view(gaussians.reflectance),
         attenuation=per_view(gaussians.attenuation),
     )
+
+
+def _on_paths(
+    paths: Float[Array, "N K 3"], lifetimes: Float[Array, "N 2"], times: Float[Array, " V"]
+) -> tuple[Float[Array, "V N 3"], Float[Array, "V N"]]:
+    """Where Gaussians are on their paths, and how much of them is there.
+
+    A Gaussian comes and goes within a part of the time between two control points of its path. Gradients flow to all
+    arguments; Gaussians of infinite lifetime are where they are, always.
+    """
+    knots = paths.shape[1]
+    lives = jnp.isfinite(lifetimes).all(-1)
+    first, last = jnp.where(lives[:, None], lifetimes, 0).T
+    outside = jnp.maximum(first[None] - times[:, None], times[:, None] - last[None])
+    there = jnp.clip(1 - (knots - 1) / FADING * outside, 0, 1)
+    displacements = jnp.einsum("vk,nkc->vnc", path_weights(times, knots), jnp.where(lives[:, None, None], paths, 0))
+    return displacements, jnp.where(lives[None], there, 1)
+
+
+def path_weights(times: Float[Array, " V"], knots: int) -> Float[Array, "V K"]:
+    """Weights of a path's control points at instants in [0, 1]: a uniform cubic spline. Carries gradients."""
+    position = jnp.clip(times, 0, 1) * (knots - 1)
+    apart = jnp.abs(position[:, None] - jnp.arange(knots, dtype=position.dtype)[None])
+    near, far = jnp.minimum(apart, 1), jnp.clip(2 - apart, 0, 1)
+    weights = jnp.where(apart < 1, 2 / 3 - near**2 + near**3 / 2, far**3 / 6)
+    return weights / weights.sum(-1, keepdims=True)  # at the ends some are missing
 
 
 def length_unit(extent: Float[Array, ""] | float, cfg: ModelConfig) -> Float[Array, ""] | float:

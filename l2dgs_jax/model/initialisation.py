@@ -2,6 +2,7 @@
 
 import dataclasses
 from functools import partial
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -21,6 +22,31 @@ LUMINANCE = np.array([0.2989, 0.587, 0.114])
 OPEN_GATE = 2.0  # logit of the factor on motion that every Gaussian starts with
 DEPTHS_PER_EXTENT = 0.25  # about the radius of a hand-held camera's path
 LEAST_SPACING = 1e-7**0.5  # of points, for the scales that Gaussians start with
+SEED_SCALE = 0.6  # of seeds, over their spacing
+MOST_KNOTS = 100  # of a path
+
+
+class Seeds(NamedTuple):
+    """S points to start from that have paths.
+
+    Attributes:
+        points: where their Gaussians are, world units.
+        colors: in the dark frames, sRGB in [0, 1].
+        spacings: how far they are from each other, world units.
+        paths: as in `Gaussians`.
+        lifetimes: as in `Gaussians`.
+    """
+
+    points: Float[np.ndarray, "S 3"]
+    colors: Float[np.ndarray, "S 3"]
+    spacings: Float[np.ndarray, " S"]
+    paths: Float[np.ndarray, "S K 3"]
+    lifetimes: Float[np.ndarray, "S 2"]
+
+
+def path_knots(num_frames: int) -> int:
+    """How many control points a path has: half as many as there are training frames, if these are not too many."""
+    return min(max(num_frames // 2, 4), MOST_KNOTS)
 
 
 def z_order(points: np.ndarray) -> np.ndarray:
@@ -44,8 +70,9 @@ def initialise(
     capacity: int,
     reflectance: np.ndarray | None = None,
     exposures: np.ndarray | None = None,
+    seeds: Seeds | None = None,
 ) -> Scene:
-    """A scene with one Gaussian a point, ready for training.
+    """A scene with one Gaussian a point, and then one a seed, ready for training.
 
     Scales are the root mean square distance to the three nearest points, illumination the luminance of the point
     (mid-grey without colours) unless `cfg.initial_illumination` says otherwise, opacity `cfg.initial_opacity`,
@@ -53,23 +80,32 @@ def initialise(
 
     Args:
         key: randomness of reflectance, attenuation, planes and networks.
-        points: [P 3] world units, P <= capacity.
+        points: [P 3] world units.
         colors: [P 3] sRGB in [0, 1], or None.
         cameras: the training cameras, [F]; their number sets the time resolution.
         cfg: shape and initial state.
-        capacity: rows to allocate; those past P are dead.
-        reflectance: [P 3] initial reflectance, for `cfg.reflectance_init` "observed".
+        capacity: rows to allocate; those past P + S are dead.
+        reflectance: [P + S 3] initial reflectance, for `cfg.reflectance_init` "observed".
         exposures: [F 3] logarithms of the frames' gains to start from, for `cfg.exposure` "drifting".
+        seeds: S of them, for `cfg.tracks`.
     """
+    distances, _ = cKDTree(points).query(points, k=min(4, len(points)))
+    mean_square = np.square(distances[:, 1:]).mean(-1) if len(points) > 1 else np.ones(1)
+    extent = camera_extent(cameras) if cfg.unit == "world" else DEPTHS_PER_EXTENT * median_depth(cameras, points)
+    paths = lifetimes = None
+    if seeds is not None:
+        still = len(points)
+        paths = np.concatenate([np.zeros((still, *seeds.paths.shape[1:])), seeds.paths])
+        lifetimes = np.concatenate([np.tile([[-np.inf, np.inf]], (still, 1)), seeds.lifetimes])
+        mean_square = np.concatenate([mean_square, np.square(SEED_SCALE * seeds.spacings)])
+        points = np.concatenate([points, seeds.points])
+        colors = None if colors is None else np.concatenate([colors, seeds.colors])
     count = len(points)
-    distances, _ = cKDTree(points).query(points, k=min(4, count))
-    mean_square = np.square(distances[:, 1:]).mean(-1) if count > 1 else np.ones(count)
     if cfg.initial_illumination is not None:
         illumination = np.full(count, cfg.initial_illumination)
     else:
         illumination = np.full(count, 0.5) if colors is None else np.asarray(colors) @ LUMINANCE
     bias = None if cfg.initial_exponents is None else networks.exponent_bias(cfg.initial_exponents)
-    extent = camera_extent(cameras) if cfg.unit == "world" else DEPTHS_PER_EXTENT * median_depth(cameras, points)
     least = LEAST_SPACING * length_unit(extent, cfg)
     rim = (1 - cfg.box_points) / 2
     arrays: tuple = (
@@ -82,6 +118,8 @@ def initialise(
         bias,
         extent,
         exposures,
+        paths,
+        lifetimes,
     )
     return _initialise(
         key,
@@ -99,10 +137,10 @@ def scene_shapes(cfg: ModelConfig, num_frames: int) -> Scene:
         cfg: shape of the scene.
         num_frames: training frames.
     """
-    rows = [
-        jax.ShapeDtypeStruct(shape, jnp.zeros(()).dtype)
-        for shape in ((1, 3), (2, 3), (1,), (1,), (1,), (1, 3), (2,), (), (num_frames, 3))
-    ]
+    shapes: tuple = ((1, 3), (2, 3), (1,), (1,), (1,), (1, 3), (2,), (), (num_frames, 3))
+    if cfg.tracks:
+        shapes += ((1, path_knots(num_frames), 3), (1, 2))
+    rows = [jax.ShapeDtypeStruct(shape, jnp.zeros(()).dtype) for shape in shapes]
     build = partial(_initialise, cfg=_static_settings(cfg), num_frames=num_frames, capacity=1)
     return jax.eval_shape(build, jax.eval_shape(lambda: jax.random.key(0)), *rows)
 
@@ -132,6 +170,8 @@ def _initialise(
     exponent_bias: Float[Array, "2"] | None,
     extent: Float[Array, ""],
     exposures: Float[Array, "F 3"] | None,
+    paths: Float[Array, "P K 3"] | None = None,
+    lifetimes: Float[Array, "P 2"] | None = None,
     *,
     cfg: ModelConfig,
     num_frames: int,
@@ -151,6 +191,8 @@ def _initialise(
         reflectance=random[cfg.reflectance_init](keys[0], (count, 3)) if reflectance is None else reflectance,
         attenuation=random[cfg.attenuation_init](keys[1], (count, 2)),
         gate=jnp.full(count, OPEN_GATE) if cfg.motion_gate else None,
+        paths=paths,
+        lifetimes=lifetimes,
     )
     params = SceneParams(
         gaussians=jax.tree.map(lambda rows: pad_rows(rows, capacity), gaussians),

@@ -7,7 +7,8 @@ from jaxtyping import Int
 
 from l2dgs_jax.config import Config
 from l2dgs_jax.data.dataset import Split
-from l2dgs_jax.training.inbetweens import Flows, draw
+from l2dgs_jax.training.flows import Flows
+from l2dgs_jax.training.inbetweens import draw
 from l2dgs_jax.training.step import Batch
 from l2dgs_jax.types import Camera
 

@@ -21,7 +21,7 @@ from l2dgs_jax.runtime.capacity import next_capacity
 from l2dgs_jax.runtime.devices import MEMBERS, VIEWS
 from l2dgs_jax.runtime.prefetch import prefetch
 from l2dgs_jax.training.batching import load_batch, next_batch
-from l2dgs_jax.training.inbetweens import neighbour_flows
+from l2dgs_jax.training.flows import neighbour_flows
 from l2dgs_jax.training.step import (
     Batch,
     StepReport,

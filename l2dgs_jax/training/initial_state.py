@@ -4,6 +4,7 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from l2dgs_jax.config import Config, overrides
 from l2dgs_jax.data.dataset import Dataset, Split
@@ -12,6 +13,7 @@ from l2dgs_jax.model.initialisation import initialise, scene_shapes, z_order
 from l2dgs_jax.model.observation import exposures, observed_colors
 from l2dgs_jax.model.tone import Darkening, darkening, recognise
 from l2dgs_jax.runtime.capacity import next_capacity
+from l2dgs_jax.training.seeds import find_seeds
 from l2dgs_jax.training.step import TrainState, begin_stage
 
 GAUSSIANS_PER_PIXEL = 0.3  # of a frame
@@ -30,9 +32,7 @@ def resolve(config: Config, dataset: Dataset) -> Config:
     """The settings with what they leave to the data filled in from points and training frames."""
     split = dataset.train
     if config.density.max_gaussians == "auto":
-        height, width = split.images.shape[1:3]
-        most = round(GAUSSIANS_PER_PIXEL * height * width)
-        config = overrides.replace(config, {"density.max_gaussians": most})
+        config = overrides.replace(config, {"density.max_gaussians": _most_gaussians(split)})
     if config.model.exposure == "auto":
         drift = exposures(dataset.points, split.cameras, split.images, split.valid).std(0).max() > DRIFT
         config = overrides.replace(config, {"model.exposure": "drifting" if drift else "steady"})
@@ -48,11 +48,19 @@ def resolve(config: Config, dataset: Dataset) -> Config:
     return dataclasses.replace(config, model=model)
 
 
+def _most_gaussians(split: Split) -> int:
+    height, width = split.images.shape[1:3]
+    return round(GAUSSIANS_PER_PIXEL * height * width)
+
+
 def initial_state(dataset: Dataset, config: Config) -> TrainState:
     """The state before the first step of a `resolve`d config; the same seed and data give the same state."""
     order, train = z_order(dataset.points), dataset.train
     points, colors = dataset.points[order], None if dataset.colors is None else dataset.colors[order]
-    capacity = len(points)
+    seeds = None
+    if config.model.tracks:
+        seeds = find_seeds(points, train, most=_most_gaussians(train))
+    capacity = len(points) + (0 if seeds is None else len(seeds.points))
     if config.density.start < config.density.stop:
         most = max(int(config.density.max_gaussians), capacity)
         capacity = most if config.density.method == "mcmc" else next_capacity(min(1.5 * capacity, most))
@@ -60,12 +68,14 @@ def initial_state(dataset: Dataset, config: Config) -> TrainState:
     if config.model.reflectance_init == "observed":
         law = split_darkening(train, config)
         observed = observed_colors(points, train.cameras, train.images, train.valid)
+        if seeds is not None:
+            observed = np.concatenate([observed, seeds.colors])
         reflectance = (observed / law.gain) ** (1 / law.exponent)
     gains = None
     if config.model.exposure == "drifting":
         gains = exposures(points, train.cameras, train.images, train.valid)
     key = jax.random.key(config.seed)
-    scene = initialise(key, points, colors, train.cameras, config.model, capacity, reflectance, gains)
+    scene = initialise(key, points, colors, train.cameras, config.model, capacity, reflectance, gains, seeds)
     return _begin_stage(scene, jnp.zeros((), jnp.int32), config, config.coarse_steps)
 
 

@@ -20,6 +20,8 @@ GAUSSIAN_GROUPS: dict[str, Any] = {
     "reflectance": "reflectance",
     "attenuation": "attenuation",
     "gate": "gate",
+    "paths": "paths",
+    "lifetimes": "lifetimes",
 }
 
 
@@ -62,6 +64,8 @@ def schedules(cfg: OptimConfig, extent: Float[Array, ""], stage_steps: int) -> d
         "scales": (cfg.scales_lr, cfg.scales_lr),
         "quats": (cfg.quats_lr, cfg.quats_lr),
         "gate": (cfg.gate_lr, cfg.gate_lr),
+        "paths": (cfg.paths_lr, cfg.paths_lr),
+        "lifetimes": (cfg.lifetimes_lr, cfg.lifetimes_lr),
         "exposures": (cfg.exposures_lr, cfg.exposures_lr),
     }
     steps = jnp.maximum(stage_steps if cfg.decay_steps is None else cfg.decay_steps, 1)

@@ -11,7 +11,7 @@ from jax.test_util import check_grads
 
 from l2dgs_jax.config import ModelConfig
 from l2dgs_jax.model import hexplane, networks
-from l2dgs_jax.model.deformation import deform
+from l2dgs_jax.model.deformation import deform, path_weights
 from l2dgs_jax.types import Camera, Gaussians, Scene, SceneParams
 
 CFG = ModelConfig(
@@ -252,3 +252,58 @@ def test_production_precision_stays_single():
     single = lambda tree: jax.tree.map(lambda x: x.astype("float32"), tree)
     moved = moved_at(single(scene()), bounds=BOUNDS.astype("float32"), cameras=single(look()), moving=True)
     assert {x.dtype for x in moved} == {np.dtype("float32")}
+
+
+KNOTS = 4
+LIFETIMES = np.array([[0, 1], [0.2, 0.7], [-1, 0.4], [0.8, 0.9], [-np.inf, np.inf], [-np.inf, np.inf]])
+PATHS = np.random.default_rng(2).normal(0, 0.3, (N, KNOTS, 3))
+
+
+def with_paths(times, paths=PATHS, lifetimes=LIFETIMES):
+    """The Gaussians at rest, and as they are on their paths."""
+    params, cameras = scene(), look(times=times)
+    gaussians = params.gaussians._replace(paths=jnp.asarray(paths), lifetimes=jnp.asarray(lifetimes))
+    rest = moved_at(params, cameras=cameras, moving=False)
+    return rest, moved_at(params._replace(gaussians=gaussians), cameras=cameras, moving=False)
+
+
+def test_gaussians_follow_their_paths():
+    times = (0.0, 1 / 3, 0.5, 0.85, 1.0)
+    rest, moved = with_paths(times)
+    expected = np.einsum("vk,nkc->vnc", path_weights(jnp.asarray(times), KNOTS), PATHS)
+    expected = expected * np.isfinite(LIFETIMES[:, :1])
+    np.testing.assert_allclose(moved.means - rest.means, expected, atol=1e-12)
+
+
+def test_paths_are_smooth_and_pass_straight_through_evenly_spaced_points():
+    times = np.linspace(0, 1, 301)
+    weights = np.asarray(path_weights(jnp.asarray(times), 6))
+    np.testing.assert_allclose(weights.sum(-1), 1)
+    inner = (times > 0.21) & (times < 0.79)
+    np.testing.assert_allclose((weights @ np.linspace(0, 1, 6))[inner], times[inner], atol=1e-12)
+    jerk = np.diff(weights, 3, axis=0)[61:-61] / times[1] ** 3
+    assert np.abs(jerk).max() < 3.01 * 5**3  # bounded: the curvature is continuous
+    check_grads(lambda t: path_weights(jnp.asarray(t), 6), (np.array([0.13, 0.52, 0.9]),), 1)
+
+
+def test_gaussians_come_and_go():
+    rest, moved = with_paths((0.1, 0.3, 0.45, 0.5, 0.95))
+    there = [
+        [1, 0, 1, 0, 1, 1],
+        [1, 1, 1, 0, 1, 1],
+        [1, 1, 0.4, 0, 1, 1],
+        [1, 1, 0, 0, 1, 1],
+        [1, 0, 0, 0.4, 1, 1],
+    ]
+    np.testing.assert_allclose(moved.opacities / rest.opacities, there, atol=1e-9)
+
+
+def test_paths_and_lifetimes_carry_gradients():
+    def total(paths, lifetimes):
+        _, moved = with_paths((0.15, 0.62), paths, jnp.concatenate([lifetimes, jnp.asarray(LIFETIMES[4:])]))
+        return jnp.sin(3 * moved.means).sum() + jnp.square(moved.opacities).sum()
+
+    check_grads(total, (PATHS, LIFETIMES[:4]), 1, modes=["rev"])
+    gradient = jax.grad(total, 1)(jnp.asarray(PATHS), jnp.asarray(LIFETIMES[:4]))
+    assert np.isfinite(gradient).all()
+    assert np.abs(gradient).max() > 0.1

@@ -13,7 +13,8 @@ from l2dgs_jax.cameras.geometry import between, camera_centres
 from l2dgs_jax.data import Split
 from l2dgs_jax.training import engine, initial_state
 from l2dgs_jax.training.batching import load_batch, next_batch, view_indices
-from l2dgs_jax.training.inbetweens import draw, neighbour_flows
+from l2dgs_jax.training.flows import neighbour_flows
+from l2dgs_jax.training.inbetweens import draw
 from l2dgs_jax.types import Camera
 
 WIDTH, HEIGHT, FRAMES, SPEED = 96, 64, 5, 5.0  # pixels a frame

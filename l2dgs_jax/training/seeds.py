@@ -1,0 +1,155 @@
+"""Gaussians to begin with on what moves, each with the path that its track tells.
+
+Points from structure from motion are of what stands still. A motion field that starts from rest must then first find
+out which of them to carry where; tracks of optical flow say so before training begins.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Float32, Int
+from scipy.spatial import cKDTree
+
+from l2dgs_jax.cameras.geometry import camera_centres
+from l2dgs_jax.data.dataset import Split
+from l2dgs_jax.model.deformation import path_weights
+from l2dgs_jax.model.initialisation import Seeds, path_knots, z_order
+from l2dgs_jax.training.flows import neighbour_flows
+from l2dgs_jax.training.tracks import SPACING, Tracks, find_tracks
+
+SHORTEST = 3  # frames that a track must be seen in
+MOVING = 0.4  # part of them in which it must be seen to move
+STRAY = 3.0  # pixels by which it must leave where any still point would be seen
+LONG = 6  # observations from which the depth of a track may change
+DEPTH_CELL = 4  # pixels a side
+NEIGHBOURS = 30  # points around a pixel that depths are taken from
+RANGE = 0.03, 0.97  # quantiles of their depths, as a few points lie astray
+GUESSES = 4  # of a depth in that range
+STIFFNESS = 1e-3  # weight of the squared bends of a path against squared distances from what was tracked
+BESIDE = 20  # pixels beyond the border in which points still count
+
+
+def find_seeds(points: Float[np.ndarray, "P 3"], split: Split, most: int) -> Seeds:
+    """Seeds on what moves between the frames; none where flow cannot tell.
+
+    What moves hides what stands behind it, so its depth is that of the nearest of the points around; it changes evenly
+    along a track.
+
+    Args:
+        points: of the scene, world units.
+        split: the frames.
+        most: how many seeds there may be; the tracks seen longest come first.
+    """
+    cameras = _Cameras(*(np.asarray(x, np.float64) for x in split.cameras))
+    height, width = split.images.shape[1:3]
+    depths = np.stack([_depths(points, *camera[:2], height, width) for camera in zip(*cameras, strict=True)], axis=1)
+    tracks = find_tracks(split, neighbour_flows(split), depths)
+    seeds = [_seed(split, cameras, depths[0], track) for track in _worthwhile(tracks, cameras, depths, most)]
+    if not seeds:
+        shapes = ((0, 3), (0, 3), (0,), (0, path_knots(len(cameras.time)), 3), (0, 2))
+        return Seeds(*(np.zeros(shape, np.float32) for shape in shapes))
+    found = Seeds(*(np.array(rows, np.float32) for rows in zip(*seeds, strict=True)))
+    order = z_order(found.points)
+    return Seeds(*(rows[order] for rows in found))
+
+
+class _Cameras(NamedTuple):
+    """A `Camera` of double precision in NumPy."""
+
+    viewmat: Float[np.ndarray, "F 4 4"]
+    K: Float[np.ndarray, "F 3 3"]
+    time: Float[np.ndarray, " F"]
+
+
+def _worthwhile(tracks: Tracks, cameras: _Cameras, depths: Float32[np.ndarray, "C F H W"], most: int) -> list[Tracks]:
+    """The tracks, apart, that are long enough and lead away from where they would if their start stood still."""
+    starts = np.flatnonzero(np.diff(tracks.numbers, prepend=-1))
+    lengths = np.diff(starts, append=len(tracks.numbers))
+    if not len(starts):
+        return []
+    strays = []
+    for depth in depths:
+        world = np.repeat(_lift(tracks, cameras, _at(tracks, depth))[starts], lengths, axis=0)
+        apart = np.linalg.norm(tracks.pixels - _project(world, tracks.frames, cameras), axis=-1)
+        strays.append(np.maximum.reduceat(apart, starts))
+    moves = np.add.reduceat(tracks.moves, starts) / lengths
+    strayed = np.min(strays, axis=0) > STRAY  # not where a depth is NaN
+    worth = np.flatnonzero((lengths >= SHORTEST) & (moves > MOVING) & strayed)
+    chosen = worth[np.argsort(-lengths[worth], kind="stable")[:most]]
+    return [Tracks(*(x[starts[i] : starts[i] + lengths[i]] for x in tracks)) for i in chosen]
+
+
+def _seed(split: Split, cameras: _Cameras, depths: Float32[np.ndarray, "F H W"], track: Tracks) -> Seeds:
+    """What one track says, the middle of it being where the Gaussian is."""
+    frames, instants = track.frames, np.unique(cameras.time)
+    times, found = cameras.time[frames], _at(track, depths)
+    if len(frames) < LONG:
+        depth = np.full(len(frames), np.median(found))
+    else:
+        depth = np.polyval(np.polyfit(times, found, 1), times)
+    way, middle = _lift(track, cameras, depth), len(frames) // 2
+    # It is there half of the time to the frames in which it is seen no more.
+    first, last = np.searchsorted(instants, times[[0, -1]]).tolist()
+    before, after = instants[max(first - 1, 0)], instants[min(last + 1, len(instants) - 1)]
+    weights = np.asarray(path_weights(jnp.asarray(times), path_knots(len(cameras.time))))
+    columns, rows = track.pixels.astype(int).T
+    return Seeds(
+        points=way[middle],
+        colors=np.median(split.images[frames, rows, columns], axis=0),
+        spacings=SPACING * depth[middle] / cameras.K[frames[middle], 0, 0],
+        paths=_fitted(weights, way - way[middle]),
+        lifetimes=np.array([before + times[0], times[-1] + after]) / 2,
+    )
+
+
+def _fitted(weights: Float[np.ndarray, "O K"], places: Float[np.ndarray, "O 3"]) -> Float[np.ndarray, "K 3"]:
+    """Control points of the straightest path, nearly through those places; beyond them it goes on as it went."""
+    bends = np.diff(np.eye(weights.shape[1]), 2, axis=0)
+    stiff = weights.T @ weights + STIFFNESS * bends.T @ bends
+    return np.linalg.solve(stiff, weights.T @ places)
+
+
+def _depths(
+    points: Float[np.ndarray, "P 3"],
+    viewmat: Float[np.ndarray, "4 4"],
+    K: Float[np.ndarray, "3 3"],
+    height: int,
+    width: int,
+) -> Float32[np.ndarray, "C H W"]:
+    """Depths that the points around each pixel have, the nearest first, world units; NaN if none are in view."""
+    local = points @ viewmat[:3, :3].T + viewmat[:3, 3]
+    local = local[local[:, 2] > 0]
+    pixels = (local @ K.T)[:, :2] / local[:, 2:]
+    inside = ((pixels > -BESIDE) & (pixels < (width + BESIDE, height + BESIDE))).all(-1)
+    if not inside.any():
+        return np.full((GUESSES, height, width), np.nan, np.float32)
+    rows, columns = (np.arange(0, size, DEPTH_CELL) + 0.5 * DEPTH_CELL for size in (height, width))
+    cells = np.stack(np.meshgrid(columns, rows), axis=-1)
+    _, around = cKDTree(pixels[inside]).query(cells, k=range(1, min(NEIGHBOURS, int(inside.sum())) + 1))
+    near, far = np.quantile(local[inside, 2][around], RANGE, axis=-1)
+    guesses = 1 / np.linspace(1 / near, 1 / far, GUESSES)
+    return np.repeat(np.repeat(guesses, DEPTH_CELL, 1), DEPTH_CELL, 2)[:, :height, :width].astype(np.float32)
+
+
+def _at(tracks: Tracks, values: Float32[np.ndarray, "F H W"]) -> Float32[np.ndarray, " O"]:
+    columns, rows = tracks.pixels.astype(int).T
+    return values[tracks.frames, rows, columns]
+
+
+def _lift(tracks: Tracks, cameras: _Cameras, depth: Float[np.ndarray, " O"]) -> Float[np.ndarray, "O 3"]:
+    """World points of observations at those depths."""
+    viewmat, K = cameras.viewmat[tracks.frames], cameras.K[tracks.frames]
+    homogeneous = np.concatenate([tracks.pixels, np.ones((len(depth), 1))], axis=-1)
+    rays = np.einsum("oij,oj->oi", np.linalg.inv(K), homogeneous)
+    return camera_centres(viewmat) + np.einsum("oji,oj->oi", viewmat[:, :3, :3], depth[:, None] * rays)
+
+
+def _project(
+    points: Float[np.ndarray, "O 3"], frames: Int[np.ndarray, " O"], cameras: _Cameras
+) -> Float[np.ndarray, "O 2"]:
+    """Pixels of world points in those frames; NaN behind the camera."""
+    viewmat, K = cameras.viewmat[frames], cameras.K[frames]
+    local = np.einsum("oij,oj->oi", viewmat[:, :3, :3], points) + viewmat[:, :3, 3]
+    seen = np.einsum("oij,oj->oi", K, local)
+    return seen[:, :2] / np.where(seen[:, 2:] > 0, seen[:, 2:], np.nan)

@@ -1,0 +1,158 @@
+"""Tracks and seeds, on a square that moves before the camera of a clip, and Gaussians with paths in a training."""
+
+import dataclasses
+import functools
+import sys
+
+import cv2
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from clips import FOCAL, HEIGHT, WIDTH, clip
+from tiny_training import FRAMES, assert_equal_states, finish, make_dataset, state_of, tiny
+
+from l2dgs_jax.data import Split
+from l2dgs_jax.model.deformation import path_weights
+from l2dgs_jax.model.initialisation import Seeds, path_knots
+from l2dgs_jax.runs import checkpoints
+from l2dgs_jax.runs.checkpoints import Checkpoint
+from l2dgs_jax.training import initial_state, relocation
+from l2dgs_jax.training.seeds import find_seeds
+from l2dgs_jax.types import Camera
+
+COUNT, MANY = 14, 10_000
+K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]], np.float32)
+
+
+def surfaces():
+    """Points on the wall, the floor and the board of the clip; none are on what moves."""
+    x, y = np.meshgrid(np.linspace(-4, 4, 40), np.linspace(-3, 0.9, 25))
+    wall = np.stack([x, y, np.full_like(x, 2.0)], axis=-1)
+    x, z = np.meshgrid(np.linspace(-4, 4, 40), np.linspace(-2, 2, 30))
+    floor = np.stack([x, np.ones_like(x), z], axis=-1)
+    x, y = np.meshgrid(np.linspace(0.1, 1.3, 12), np.linspace(-0.3, 0.9, 12))
+    board = np.stack([x, y, np.full_like(x, 0.6)], axis=-1)
+    return np.concatenate([part.reshape(-1, 3) for part in (wall, floor, board)]).astype(np.float32)
+
+
+@functools.cache
+def filmed(block):
+    pictures, views, squares = clip(COUNT, reach=0.3, light=0.2, block=block)
+    cameras = Camera(
+        np.stack(views).astype(np.float32),
+        np.tile(K, (COUNT, 1, 1)),
+        np.linspace(0, 1, COUNT, dtype=np.float32),
+    )
+    return Split(tuple(map(str, range(COUNT))), cameras, np.stack(pictures).astype(np.float16)), squares
+
+
+@functools.cache
+def found():
+    return find_seeds(surfaces(), filmed(block=True)[0], MANY)
+
+
+def seen(seeds, split, frame):
+    """Pixels where the seeds that live in a frame are seen in it, by their paths."""
+    time, viewmat = float(split.cameras.time[frame]), split.cameras.viewmat[frame]
+    live = (seeds.lifetimes[:, 0] <= time) & (time <= seeds.lifetimes[:, 1])
+    weights = np.asarray(path_weights(jnp.array([time]), seeds.paths.shape[1]))[0]
+    local = (seeds.points[live] + weights @ seeds.paths[live]) @ viewmat[:3, :3].T + viewmat[:3, 3]
+    return (local @ K.T)[:, :2] / local[:, 2:]
+
+
+@pytest.mark.parametrize("frame", [2, 6, 11])
+def test_seeds_follow_what_moves_and_cover_it(frame):
+    split, squares = filmed(block=True)
+    columns, rows = np.clip(seen(found(), split, frame).astype(int), 0, [WIDTH - 1, HEIGHT - 1]).T
+    square = squares[frame].astype(np.uint8)
+    assert cv2.dilate(square, np.ones((9, 9), np.uint8))[rows, columns].mean() > 0.85
+    covered = np.zeros_like(square)
+    covered[rows, columns] = 1
+    assert cv2.dilate(covered, np.ones((9, 9), np.uint8))[square > 0].mean() > 0.85
+
+
+def test_seeds_have_the_colours_of_what_they_are_on():
+    split, squares = filmed(block=True)
+    shown = np.concatenate([image[square] for image, square in zip(split.images, squares, strict=True)])
+    np.testing.assert_allclose(found().colors.mean(0), shown.mean(0), atol=0.01)
+    assert np.corrcoef(found().colors.T).min() < 0.99
+
+
+def test_where_nothing_moves_there_are_no_seeds():
+    assert len(find_seeds(surfaces(), filmed(block=False)[0], MANY).points) < 0.03 * len(found().points)
+
+
+def test_there_are_no_more_seeds_than_wanted_and_the_longest_are_kept():
+    few = find_seeds(surfaces(), filmed(block=True)[0], 20)
+    length = lambda seeds: seeds.lifetimes[:, 1] - seeds.lifetimes[:, 0]
+    assert len(few.points) == 20
+    assert length(few).min() >= np.sort(length(found()))[-60]
+
+
+@pytest.mark.parametrize("why", ["noise", "no points in view", "not valid"])
+def test_where_flow_or_depth_cannot_tell_there_are_no_seeds(why):
+    split, points = filmed(block=True)[0], surfaces()
+    if why == "noise":
+        images = np.random.default_rng(0).uniform(0, 0.3, split.images.shape).astype(np.float16)
+        split = dataclasses.replace(split, images=images)
+    elif why == "no points in view":
+        points = points - np.float32([0, 0, 100])
+    else:
+        split = dataclasses.replace(split, valid=np.zeros(split.images.shape[:3], bool))
+    seeds = find_seeds(points, split, MANY)
+    assert [x.shape for x in seeds] == [(0, 3), (0, 3), (0,), (0, path_knots(COUNT), 3), (0, 2)]
+
+
+SOME = Seeds(
+    points=np.array([[0.1, 0.2, 2.5], [-0.3, 0.1, 2.2]], np.float32),
+    colors=np.array([[0.1, 0.12, 0.11], [0.2, 0.1, 0.05]], np.float32),
+    spacings=np.array([0.1, 0.2], np.float32),
+    paths=np.random.default_rng(0).uniform(-0.2, 0.2, (2, path_knots(FRAMES), 3)).astype(np.float32),
+    lifetimes=np.array([[0, 0.5], [0.3, 1]], np.float32),
+)
+
+
+@pytest.fixture
+def tracked(monkeypatch):
+    """Settings and a state that starts from the two seeds."""
+    module = sys.modules["l2dgs_jax.training.initial_state"]  # its function has the same name
+    monkeypatch.setattr(module, "find_seeds", lambda *_, most: SOME)
+    config = tiny()
+    config = dataclasses.replace(config, model=dataclasses.replace(config.model, tracks=True))
+    return config, initial_state(make_dataset(), config)
+
+
+def test_a_training_starts_with_the_seeds_after_the_points(tracked):
+    scene = tracked[1].scene
+    points = len(make_dataset().points)
+    gaussians = jax.tree.map(lambda rows: np.asarray(rows)[points : points + 2], scene.params.gaussians)
+    assert int(scene.alive.sum()) == points + 2
+    np.testing.assert_allclose(gaussians.means, SOME.points)
+    np.testing.assert_allclose(gaussians.paths, SOME.paths)
+    np.testing.assert_allclose(gaussians.lifetimes, SOME.lifetimes)
+    first, second = gaussians.reflectance
+    assert first[0] < second[0]
+    assert first[2] > second[2]
+    assert np.isinf(scene.params.gaussians.lifetimes[:points]).all()
+
+
+def test_only_seeds_learn_their_paths(tracked):
+    config, start = tracked
+    end = state_of(finish(make_dataset(), config, start)).scene
+    points = len(make_dataset().points)
+    before, after = (np.asarray(scene.params.gaussians.paths)[: points + 2] for scene in (start.scene, end))
+    moved = np.abs(after - before).max((1, 2))
+    assert not moved[:points].any()
+    assert (moved[points:] > 0).all()
+
+
+def test_paths_are_born_and_saved_with_their_gaussians(tracked, tmp_path):
+    config, state = tracked
+    gaussians, alive = state.scene.params.gaussians, state.scene.alive
+    born = relocation.relocate(gaussians, alive, alive.sum() + 8, jax.random.key(0), 0.0)
+    rows = np.asarray(born.alive)
+    for path, life in zip(born.gaussians.paths[rows], born.gaussians.lifetimes[rows], strict=True):
+        assert np.isinf(life).all() != bool(np.abs(path).any())
+    checkpoints.save(tmp_path / "checkpoint.npz", Checkpoint(state, 64), config)
+    assert_equal_states(checkpoints.load(tmp_path / "checkpoint.npz", config, FRAMES).state, state)
