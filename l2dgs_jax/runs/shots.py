@@ -33,7 +33,7 @@ class Shots(NamedTuple):
     names: tuple[str, ...]
     cameras: Camera
     size: tuple[int, int]
-    fps: float = RATE
+    fps: float | int = RATE
 
     def resized(self, size: tuple[int, int]) -> "Shots":
         """The same in images of another size, see `reframe`."""

@@ -45,7 +45,7 @@ def write_videos(
     shown: Mapping[Path, Sequence[Output]],
     *,
     size: tuple[int, int] | None = None,
-    fps: float = RATE,
+    fps: float | int = RATE,
 ) -> list[Path]:
     """Write videos of the same cameras, whole or not at all.
 

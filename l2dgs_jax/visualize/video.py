@@ -19,7 +19,7 @@ _BT709, _SRGB, _BT601, _LIMITED = 1, 13, 6, 1  # numbers of ITU-T H.273: primari
 
 
 @contextlib.contextmanager
-def open_video(stem: Path, size: tuple[int, int], fps: float) -> Iterator[Add]:
+def open_video(stem: Path, size: tuple[int, int], fps: float | int) -> Iterator[Add]:
     """Write a video whole or not at all: what is yielded adds a frame, RGB.
 
     Codecs want even sizes: the last column or row of an odd one is doubled.
@@ -56,7 +56,7 @@ def _pyav() -> Any:
 
 
 @contextlib.contextmanager
-def _h264(path: Path, size: tuple[int, int], fps: float) -> Iterator[Add]:
+def _h264(path: Path, size: tuple[int, int], fps: float | int) -> Iterator[Add]:
     av = _pyav()
     # The index goes to the front, so that a browser starts before it has the whole file.
     with av.open(str(path), "w", format="mp4", options={"movflags": "+faststart"}) as file:
@@ -75,7 +75,7 @@ def _h264(path: Path, size: tuple[int, int], fps: float) -> Iterator[Add]:
 
 
 @contextlib.contextmanager
-def _vp8(path: Path, size: tuple[int, int], fps: float) -> Iterator[Add]:
+def _vp8(path: Path, size: tuple[int, int], fps: float | int) -> Iterator[Add]:
     # VP9 takes seven times as long for files half as large; H.264 is in no wheel of OpenCV.
     with _silence():
         writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"VP80"), fps, size)  # type: ignore[attr-defined]
