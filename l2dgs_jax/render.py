@@ -117,7 +117,8 @@ def _shots(run: Run, options: Render) -> Shots:
         sides = [int(side) for side in options.size.split("x")]
         width, height = sides if len(sides) == 2 else (sides[0], max(1, round(height * sides[0] / width)))
     if not 1 <= min(width, height) <= max(width, height) <= LONGEST_SIDE:
-        raise UserError(f"pictures of {width}x{height} pixels; expected a --size from 1 to {LONGEST_SIDE} on each side")
+        source = f"--size {options.size}" if options.size else f"--path {options.path}"
+        raise UserError(f"{source}: {width}x{height} pixels; expected from 1 to {LONGEST_SIDE} on each side")
     return wanted.resized((width, height)) if options.size else wanted
 
 

@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 
 from l2dgs_jax.cameras.geometry import camera_centres
@@ -156,7 +157,8 @@ def _cameras(
 
 
 def _most_central(centres: Float[np.ndarray, "F 3"]) -> int:
-    return int(np.argmin(np.linalg.norm(centres - np.median(centres, axis=0), axis=-1)))
+    """The one that is nearest to all others in the mean."""
+    return int(cdist(centres, centres).sum(0).argmin())
 
 
 def _nearby(at: Float[np.ndarray, " A"], times: Float[np.ndarray, " F"], bandwidth: float) -> Float[np.ndarray, "A F"]:

@@ -84,9 +84,14 @@ def test_a_browser_can_start_before_it_has_the_whole_file(tmp_path):
 def test_an_interrupted_video_leaves_the_old_one(tmp_path, decode):
     path = write(tmp_path / "video", moving_ramp(5, 64, 64))
     before = path.read_bytes()
-    with pytest.raises(KeyboardInterrupt), open_video(tmp_path / "video", (64, 64), 24) as add:
-        add(moving_ramp(1, 64, 64)[0])
-        raise KeyboardInterrupt
+
+    def interrupt():
+        with open_video(tmp_path / "video", (64, 64), 24) as add:
+            add(moving_ramp(1, 64, 64)[0])
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupt()
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]
 
