@@ -93,7 +93,7 @@ def test_an_interrupted_folder_ends_up_as_an_uninterrupted_one(base, tmp_path, m
     exponents = cv2.imread(str(tmp_path / "whole" / "train" / "b2" / "000000.png"), cv2.IMREAD_UNCHANGED)
     run = finished_run.opened(base)
     expected = np.asarray(run.render(run.dataset.train.camera(0)).images.attenuation[..., 1])
-    np.testing.assert_allclose(exponents * 10 / 65535, expected, atol=1e-4)
+    np.testing.assert_allclose(exponents * (10 / 65535), expected, atol=1e-4)
 
 
 def test_frames_of_other_options_are_not_mixed(base, tmp_path, capsys):
