@@ -1,5 +1,6 @@
 """`python -m l2dgs_jax.render RUN`: a run's held-out views, or a path through its scene, as pictures or videos."""
 
+import os
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -15,11 +16,12 @@ from l2dgs_jax.runs import Run, open_run, pictures, shots
 from l2dgs_jax.runs.pictures import Output
 from l2dgs_jax.runs.shots import FLIGHTS, Shots
 from l2dgs_jax.runtime import command_line
+from l2dgs_jax.runtime.files import make_folder
 from l2dgs_jax.types import RenderOutput
 from l2dgs_jax.visualize import display, films
 
 FRAMES = 96
-LONGEST_SIDE = 16384  # pixels that codecs take
+LONGEST_SIDE = 16382  # pixels that codecs take
 
 
 @dataclass(frozen=True)
@@ -69,7 +71,7 @@ class Render:
             UserError: an option has no meaning, by itself or beside the others.
         """
         flies, freezes = self.path in FLIGHTS, self.path in ("freeze-time", "freeze-camera")
-        if not flies and self.path != "dataset" and not Path(self.path).is_file():
+        if not flies and self.path != "dataset" and not os.path.isfile(self.path):
             raise UserError(f"--path {self.path}: no such file; expected one, or dataset, {', '.join(FLIGHTS)}")
         if not flies and (self.frames is not None or self.times is not None):
             raise UserError(f"--path {self.path}: has its own frames; expected no --frames and no --times")
@@ -77,13 +79,9 @@ class Render:
             raise UserError(f"--at {self.at:g}: nothing stands still; expected --path freeze-time or freeze-camera")
         for instant in (*(self.times or ()), *([] if self.at is None else [self.at])):
             if not 0 <= instant <= 1:
-                raise UserError(
-                    f"--times, --at: {instant:g} is no instant; expected 0, the first frame, to 1, the last"
-                )
+                raise UserError(f"--times, --at: {instant:g} is no instant; expected 0, the first, to 1, the last")
         if self.frames is not None and self.frames < 1:
             raise UserError(f"--frames {self.frames}: expected at least 1")
-        if self.fps is not None and not 0 < self.fps <= 1000:
-            raise UserError(f"--fps {self.fps:g}: expected a number above 0, at most 1000")
         if self.side_by_side and (len(self.outputs) < 2 or self.format == "exr"):
             raise UserError("--side-by-side: expected at least two --outputs, and --format png or video")
         if not self.outputs or len(set(self.outputs)) < len(self.outputs):
@@ -99,6 +97,7 @@ def main(arguments: Sequence[str]) -> None:
     run = open_run(options.run, options.stage)
     wanted = _shots(run, options)
     base = options.output or options.run / ("renders" if options.stage == "final" else "renders_coarse")
+    make_folder(base / wanted.title)
     write = _write_videos if options.format == "video" else _write_frames
     write(run, wanted, base / wanted.title, options)
 
@@ -116,25 +115,27 @@ def _shots(run: Run, options: Render) -> Shots:
     if options.size:
         sides = [int(side) for side in options.size.split("x")]
         width, height = sides if len(sides) == 2 else (sides[0], max(1, round(height * sides[0] / width)))
-    if not 1 <= min(width, height) <= max(width, height) <= LONGEST_SIDE:
+    longest = max(width * (len(options.outputs) if options.side_by_side else 1), height)
+    if min(width, height) < 1 or longest > LONGEST_SIDE:
         source = f"--size {options.size}" if options.size else f"--path {options.path}"
-        raise UserError(f"{source}: {width}x{height} pixels; expected from 1 to {LONGEST_SIDE} on each side")
-    return wanted.resized((width, height)) if options.size else wanted
+        raise UserError(f"{source}: {width}x{height} pixels; expected at least 1, and no picture over {LONGEST_SIDE}")
+    fps = wanted.fps if options.fps is None else options.fps
+    if not 0 < fps <= 1000:
+        raise UserError(f"{fps:g} frames a second; expected --fps above 0 and up to 1000")
+    return (wanted.resized((width, height)) if options.size else wanted)._replace(fps=fps)
 
 
 def _write_frames(run: Run, wanted: Shots, folder: Path, options: Render) -> None:
     draw: Callable[[RenderOutput], pictures.Pictures]
     if options.side_by_side:
-        name, ranges = (
-            "-".join(options.outputs),
-            films.sampled_ranges(run, wanted.cameras, options.outputs, wanted.size),
-        )
+        name = "-".join(options.outputs)
+        ranges = films.sampled_ranges(run, wanted.cameras, options.outputs, wanted.size)
         kinds, draw = [name], lambda output: {name: display.side_by_side(output, options.outputs, ranges)}
     else:
         kinds = list(options.outputs)
         draw = partial(pictures.as_floats if options.format == "exr" else pictures.as_integers, kinds=options.outputs)
     suffix: Literal[".png", ".exr"] = ".exr" if options.format == "exr" else ".png"
-    new = pictures.write_frames(run, wanted.cameras, wanted.names, folder, kinds, draw, suffix=suffix, size=wanted.size)
+    new = pictures.write_frames(run, wanted, folder, kinds, draw, suffix)
     there = len(wanted.names) - new
     print(f"wrote {new} views to {folder}{f'; {there} were there already' if there else ''}")
 
@@ -142,7 +143,7 @@ def _write_frames(run: Run, wanted: Shots, folder: Path, options: Render) -> Non
 def _write_videos(run: Run, wanted: Shots, folder: Path, options: Render) -> None:
     groups = [options.outputs] if options.side_by_side else [(kind,) for kind in options.outputs]
     shown = {folder / "-".join(kinds): kinds for kinds in groups}
-    files = films.write_videos(run, wanted.cameras, shown, size=wanted.size, fps=options.fps or wanted.fps)
+    files = films.write_videos(run, wanted.cameras, shown, size=wanted.size, fps=wanted.fps)
     print(f"wrote {' and '.join(map(str, files))}")
 
 

@@ -15,6 +15,7 @@ from l2dgs_jax.data.parsing import numbers, read_json
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.model.rendering import expected_depth
 from l2dgs_jax.runs.run import Run
+from l2dgs_jax.runs.shots import Shots
 from l2dgs_jax.runs.views import views
 from l2dgs_jax.runtime.files import make_folder, replacing, write_json
 from l2dgs_jax.types import Camera, RenderOutput
@@ -60,14 +61,11 @@ def as_floats(output: RenderOutput, kinds: Sequence[Output]) -> Pictures:
 
 def write_frames(
     run: Run,
-    cameras: Camera,
-    names: Sequence[str],
+    shots: Shots,
     folder: Path,
     kinds: Sequence[str],
     draw: Callable[[RenderOutput], Pictures],
-    *,
     suffix: Literal[".png", ".exr"] = ".png",
-    size: tuple[int, int] | None = None,
 ) -> int:
     """Render the cameras whose pictures `folder` does not hold yet, to KIND/NAME.png or .exr.
 
@@ -76,13 +74,11 @@ def write_frames(
 
     Args:
         run: the run.
-        cameras: the batch.
-        names: of the cameras.
+        shots: what to render.
         folder: to write to; its `render.json` says what its frames depend on.
         kinds: what `draw` makes pictures of.
         draw: pictures of a view, by kind; depth to be scaled is a picture of floats.
         suffix: of the files.
-        size: width and height, pixels; the data set's if not given.
 
     Returns:
         How many cameras were rendered now.
@@ -90,12 +86,13 @@ def write_frames(
     Raises:
         UserError: the folder holds frames rendered otherwise, or a file cannot be written.
     """
-    _claim(folder, kinds, _record(run, cameras, size, suffix))
+    names = shots.names
+    _claim(folder, kinds, _record(run, shots, suffix))
     for place in {(folder / kind / name).parent for kind in kinds for name in names}:
         make_folder(place)
     missing = [i for i, name in enumerate(names) if not all(_written(folder / kind, name, suffix) for kind in kinds)]
-    chosen = Camera(*(x[np.array(missing, int)] for x in cameras))
-    for i, output in zip(missing, views(run, chosen, size), strict=True):
+    chosen = Camera(*(x[np.array(missing, int)] for x in shots.cameras))
+    for i, output in zip(missing, views(run, chosen, shots.size), strict=True):
         for kind, picture in draw(output).items():
             if suffix == ".png" and picture.dtype.kind == "f":
                 _save(folder / kind / f"{names[i]}.npy", picture)
@@ -106,12 +103,12 @@ def write_frames(
     return len(missing)
 
 
-def _record(run: Run, cameras: Camera, size: tuple[int, int] | None, suffix: str) -> dict[str, Any]:
+def _record(run: Run, shots: Shots, suffix: str) -> dict[str, Any]:
     """What frames depend on."""
-    width, height = size or (run.dataset.width, run.dataset.height)
+    width, height = shots.size
     return {
         "scene": _digest([run.state.step, run.state.scene]),
-        "cameras": _digest(cameras),
+        "cameras": _digest(shots.cameras),
         "size": f"{width}x{height}",
         "format": suffix[1:],
     }

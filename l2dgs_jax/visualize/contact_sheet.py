@@ -42,7 +42,7 @@ def contact_sheet(run: Run, rows: int = 4) -> UInt8[np.ndarray, "H W 3"]:
 
     ranges = display.ranges(outputs)
     columns = [name for name in COLUMNS if name != "truth" or split.welllit is not None]
-    headings = [_heading(name, ranges.get(RENDERED.get(name, "welllit"))) for name in columns]
+    headings = [_heading(name, ranges) for name in columns]
 
     lines = []
     kind = "held out" if held_out else "trained on"
@@ -56,5 +56,6 @@ def contact_sheet(run: Run, rows: int = 4) -> UInt8[np.ndarray, "H W 3"]:
     return sheet(headings, lines)
 
 
-def _heading(name: str, span: tuple[float, float] | None) -> str:
+def _heading(name: str, ranges: display.Ranges) -> str:
+    span = ranges.get(RENDERED[name]) if name in RENDERED else None
     return f"{name} {span[0]:.5g}-{span[1]:.5g}" if span else name

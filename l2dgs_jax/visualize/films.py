@@ -13,7 +13,6 @@ from l2dgs_jax.runs.pictures import Output
 from l2dgs_jax.runs.run import Run
 from l2dgs_jax.runs.shots import RATE
 from l2dgs_jax.runs.views import views
-from l2dgs_jax.runtime.files import make_folder
 from l2dgs_jax.types import Camera
 from l2dgs_jax.visualize import display
 from l2dgs_jax.visualize.video import open_video, video_path
@@ -67,7 +66,6 @@ def write_videos(
     with contextlib.ExitStack() as stack:
         videos = []
         for stem, kinds in shown.items():
-            make_folder(stem.parent)
             videos.append((stack.enter_context(open_video(stem, (len(kinds) * width, height), fps)), kinds))
         for output in views(run, cameras, size):
             for add, kinds in videos:

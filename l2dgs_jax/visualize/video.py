@@ -93,7 +93,9 @@ def _vp8(path: Path, size: tuple[int, int], fps: float | int) -> Iterator[Add]:
     finally:
         writer.release()
     written = cv2.VideoCapture(str(path))
-    if sum(iter(written.grab, False)) != added:
+    complete = sum(iter(written.grab, False)) == added
+    written.release()
+    if not complete:
         raise OSError(0, "frames are missing, the disk may be full")  # of which OpenCV says nothing
 
 
