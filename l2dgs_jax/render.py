@@ -120,8 +120,8 @@ def _shots(run: Run, options: Render) -> Shots:
         source = f"--size {options.size}" if options.size else f"--path {options.path}"
         raise UserError(f"{source}: {width}x{height} pixels; expected at least 1, and no picture over {LONGEST_SIDE}")
     fps = wanted.fps if options.fps is None else options.fps
-    if not 0 < fps <= 1000:
-        raise UserError(f"{fps:g} frames a second; expected --fps above 0 and up to 1000")
+    if not 0.1 <= fps <= 1000:
+        raise UserError(f"{fps:g} frames a second; expected --fps from 0.1 to 1000")
     return (wanted.resized((width, height)) if options.size else wanted)._replace(fps=fps)
 
 

@@ -60,7 +60,7 @@ def interpolate(cameras: Camera, times: Float[np.ndarray, " T"]) -> Camera:
 def spiral(cameras: Camera, depth: float, times: Float[np.ndarray, " T"]) -> Camera:
     """Two turns around the most central view, looking at the centre of attention (as LLFF, arXiv 1905.00889).
 
-    They are as wide as the trained views spread, but never so wide or so narrow that nothing is seen of it.
+    They are as wide as the trained views spread, within bounds: some parallax shows, and the scene stays in view.
 
     Args:
         cameras: F trained views in any order.
@@ -109,7 +109,7 @@ def orbit(cameras: Camera, depth: float, times: Float[np.ndarray, " T"]) -> Came
     if gaps.max() > ALL_AROUND:
         first = angles[(gaps.argmax() + 1) % len(angles)]
         half = (2 * np.pi - gaps.max()) / 2
-        phase = first + half + max(half, 0.1) * np.sin(phase)
+        phase = first + half + max(half, 0.1) * np.sin(phase)  # a tripod's views sway a little, too
     circle = np.outer(np.cos(phase), ahead) + np.outer(np.sin(phase), beside)
     places = target + np.median(heights) * up + np.median(radii) * circle
     return _cameras(_looking_at(target, places, up), places, np.asarray(cameras.K[central]), times, cameras)

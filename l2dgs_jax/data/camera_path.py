@@ -1,9 +1,11 @@
 """The `camera_path.json` of nerfstudio: cameras to render, as its viewer writes them.
 
-render_width, render_height    of the images, pixels
-[fps]                          frames a second
-camera_path                    for each camera: camera_to_world (16 numbers, row by row, axes right, up, back),
-                               fov (vertical, degrees) and [render_time] or [time] in [0, 1]
+    [render_width, render_height]   of the images, pixels
+    [fps]                           frames a second
+    camera_path                     for each camera: camera_to_world (16 numbers, row by row; axes right, up, back),
+                                    fov (vertical, degrees) and [render_time] or [time] in [0, 1]
+
+All else is for the viewer alone.
 """
 
 from pathlib import Path
@@ -78,7 +80,7 @@ def _intrinsics(source: str, entry: dict[str, Any], size: tuple[int, int]) -> Fl
 
 
 def _time(source: str, entry: dict[str, Any]) -> float:
-    key = next((key for key in _TIMES if key in entry), _TIMES[0])
+    key = next((key for key in _TIMES if entry.get(key) is not None), _TIMES[0])
     time = float(numbers(source, entry, key, ()))
     if not 0 <= time <= 1:
         raise UserError(f"{source}: '{key}' is {time:g}; expected an instant from 0 to 1")

@@ -3,7 +3,7 @@
 import hashlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import jax
 import numpy as np
@@ -21,7 +21,6 @@ from l2dgs_jax.runtime.files import make_folder, replacing, write_json
 from l2dgs_jax.types import Camera, RenderOutput
 
 Output = Literal["welllit", "lowlight", "illumination", "reflectance", "b1", "b2", "depth", "alpha"]
-OUTPUTS: tuple[Output, ...] = get_args(Output)
 RECORD = "render.json"
 DEPTH_UNIT = "depth.json"
 EXPONENT_UNIT = 10 / 65535  # of b1 and b2 in 16 bits; exponents lie between 1 and 10
@@ -30,7 +29,7 @@ Pictures = dict[str, Shaped[np.ndarray, "H W *C"]]  # by kind
 
 
 def values(output: RenderOutput, kind: Output) -> Float[np.ndarray, "H W *C"]:
-    """One of `OUTPUTS`: sRGB values or parts in [0, 1], exponents between 1 and 10, or mean depth in world units."""
+    """One output of a view: sRGB values or parts in [0, 1], exponents from 1 to 10, or mean depth in world units."""
     if kind == "depth":
         return expected_depth(output)
     if kind == "alpha":
@@ -147,13 +146,15 @@ def _save(path: Path, array: np.ndarray) -> None:
 def _scale_depths(folder: Path, names: Sequence[str]) -> None:
     """Turn depths that wait as floats into pictures, in one unit for all, so that the depth of a video is steady."""
     waiting = {name: folder / "depth" / f"{name}.npy" for name in names}
-    waiting = {name: path for name, path in waiting.items() if path.exists()}
+    waiting = {name: array for name, array in waiting.items() if array.exists()}
+    if not waiting:
+        return
     path = folder / DEPTH_UNIT
-    if waiting and not path.exists():
+    if not path.exists():
         unit = max([1e-12, *(float(np.load(array).max()) for array in waiting.values())]) / 65535
         write_json(path, {"unit": unit, "meaning": "depth = value * unit, 0 where empty"})
+    unit = float(numbers(path, read_json(path, "the unit of depth"), "unit", ()))
     for name, array in waiting.items():
-        unit = float(numbers(path, read_json(path, "the unit of depth"), "unit", ()))
         scaled = np.clip(np.round(np.load(array) / unit), 0, 65535)
         write_image(folder / "depth" / f"{name}.png", scaled.astype(np.uint16))
         array.unlink()

@@ -79,7 +79,7 @@ def of_file(run: Run, path: Path) -> Shots:
         UserError: it cannot be read or has no cameras.
     """
     cameras, size, fps = read_camera_path(path, _size(run))
-    return Shots(path.stem, _numbered(len(cameras.time)), cameras, size, fps or RATE)
+    return Shots(path.stem, _numbered(len(cameras.time)), cameras, size, RATE if fps is None else fps)
 
 
 def _depth(run: Run) -> float:

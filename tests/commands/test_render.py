@@ -194,7 +194,7 @@ def camera_path(**changes):
         (["{run}", "--size", "99999x10"], "--size 99999x10: 99999x10 pixels; expected"),
         (["{run}", "--size", "-5"], "--size -5: expected WIDTH or WIDTHxHEIGHT"),
         (["{run}", "--size", "wide"], "--size wide: expected WIDTH or WIDTHxHEIGHT"),
-        (["{run}", "--fps", "0"], "0 frames a second; expected --fps above 0"),
+        (["{run}", "--fps", "0"], "0 frames a second; expected --fps from 0.1"),
         (["{run}", "--outputs"], "expected at least one, and none of them twice"),
         (["{run}", "--outputs", "depth", "depth"], "expected at least one, and none of them twice"),
         (["{run}", "--outputs", "depth", "--side-by-side"], "--side-by-side: expected at least two --outputs"),

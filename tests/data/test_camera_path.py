@@ -46,7 +46,8 @@ def test_the_field_of_view_is_vertical(tmp_path):
 
 @pytest.mark.parametrize("key", ["render_time", "time"])
 def test_instants_are_the_files_or_run_evenly(tmp_path, key):
-    timed = write(tmp_path / "a.json", [entry(**{key: t}) for t in (0.5, 0, 1)])
+    other = {"render_time": "time", "time": "render_time"}[key]
+    timed = write(tmp_path / "a.json", [entry(**{other: None, key: t}) for t in (0.5, 0, 1)])
     np.testing.assert_allclose(read_camera_path(timed, SIZE).cameras.time, [0.5, 0, 1])
     plain = write(tmp_path / "b.json", [entry(), entry(**{key: None}), entry()])
     np.testing.assert_allclose(read_camera_path(plain, SIZE).cameras.time, [0, 0.5, 1])
