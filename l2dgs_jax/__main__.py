@@ -6,7 +6,7 @@ import sys
 COMMANDS = {
     "train": "train a scene from a dark video with poses",
     "evaluate": "score a run's held-out views",
-    "render": "a run's views as images",
+    "render": "a run's views, or a flight through it, as pictures or videos",
     "sweep": "train a study of scenes, seeds and settings",
     "prepare": "poses and points for a video of one's own",
     "convert": "a scene in another program's layout",

@@ -1,46 +1,150 @@
-"""`python -m l2dgs_jax.render RUN`: the held-out views as images, with their decomposition and depth."""
+"""`python -m l2dgs_jax.render RUN`: a run's held-out views, or a path through its scene, as pictures or videos."""
 
-from collections.abc import Sequence
+import os
+import re
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
+import numpy as np
 import tyro
 
-from l2dgs_jax.runs import open_run
-from l2dgs_jax.runs.pictures import write_views
-from l2dgs_jax.runs.views import get_split
+from l2dgs_jax.errors import UserError
+from l2dgs_jax.runs import Run, open_run, pictures, shots
+from l2dgs_jax.runs.pictures import Output
+from l2dgs_jax.runs.shots import FLIGHTS, Shots
 from l2dgs_jax.runtime import command_line
+from l2dgs_jax.runtime.files import make_folder
+from l2dgs_jax.types import RenderOutput
+from l2dgs_jax.visualize import display, films
+
+FRAMES = 96
+LONGEST_SIDE = 16382  # pixels that codecs take
 
 
 @dataclass(frozen=True)
 class Render:
-    """Render every view of a split: DIR/SPLIT/{welllit,lowlight,illumination,reflectance,depth}/NAME.png.
+    """Render a run to DIR/PATH/OUTPUT/NAME.png, or with --format video to DIR/PATH/OUTPUT.mp4 (.webm without PyAV).
 
-    Depth is 16-bit: a value v stands for v * unit, in the units of the scene's cameras, with the unit in
-    DIR/SPLIT/depth.json; 0 means that nothing is there.
+    Frames that are there already are not rendered again. Depth is 16-bit: a value v stands for v * unit, in the units
+    of the scene's cameras, with the unit in DIR/PATH/depth.json; 0 means that nothing is there.
 
     Attributes:
         run: folder of the run.
-        split: which views.
+        path: which way the camera goes. dataset: the views of a split, whose name stands for PATH; interpolate: along
+            the trained views; spiral: around the most central one; orbit: around what the cameras look at; freeze-time:
+            along the trained views while time stands still; freeze-camera: nowhere while time runs; or a
+            camera_path.json of nerfstudio, whose name stands for PATH.
+        split: which views, for --path dataset.
+        frames: how many pictures of a path; 96 if not given.
+        times: first and last instant of a path, within 0 and 1; all of it if not given.
+        at: the instant at which freeze-time stops, or whose camera freeze-camera keeps; 0.5 if not given.
+        outputs: what to show.
+        side_by_side: show the outputs next to each other in one picture.
+        size: WIDTH or WIDTHxHEIGHT of a picture, pixels; one of another shape is cut, not stretched.
+        format: png, exr (floating point, well-lit and low-light images in linear light), or video.
+        fps: frames a second of a video; those of the camera_path.json, or 24, if not given.
         output: folder to write to; RUN/renders if not given (RUN/renders_coarse for the coarse stage).
         stage: the last checkpoint, or the one at the end of the coarse stage.
     """
 
-    run: tyro.conf.Positional[Path]
+    run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
+    path: Annotated[str, tyro.conf.arg(metavar="NAME|FILE.json")] = "dataset"
     split: Literal["test", "train"] = "test"
+    frames: int | None = None
+    times: tuple[float, float] | None = None
+    at: float | None = None
+    outputs: tuple[Output, ...] = ("welllit", "lowlight", "illumination", "reflectance", "depth")
+    side_by_side: bool = False
+    size: Annotated[str | None, tyro.conf.arg(metavar="WIDTH[xHEIGHT]")] = None
+    format: Literal["png", "exr", "video"] = "png"
+    fps: float | None = None
     output: Path | None = None
     stage: Literal["final", "coarse"] = "final"
+
+    def check(self) -> None:
+        """Complain of what can be told to be wrong before the run is read.
+
+        Raises:
+            UserError: an option has no meaning, by itself or beside the others.
+        """
+        flies, freezes = self.path in FLIGHTS, self.path in ("freeze-time", "freeze-camera")
+        if not flies and self.path != "dataset" and not os.path.isfile(self.path):
+            raise UserError(f"--path {self.path}: no such file; expected one, or dataset, {', '.join(FLIGHTS)}")
+        if not flies and (self.frames is not None or self.times is not None):
+            raise UserError(f"--path {self.path}: has its own frames; expected no --frames and no --times")
+        if not freezes and self.at is not None:
+            raise UserError(f"--at {self.at:g}: nothing stands still; expected --path freeze-time or freeze-camera")
+        for instant in (*(self.times or ()), *([] if self.at is None else [self.at])):
+            if not 0 <= instant <= 1:
+                raise UserError(f"--times, --at: {instant:g} is no instant; expected 0, the first, to 1, the last")
+        if self.frames is not None and self.frames < 1:
+            raise UserError(f"--frames {self.frames}: expected at least 1")
+        if self.side_by_side and (len(self.outputs) < 2 or self.format == "exr"):
+            raise UserError("--side-by-side: expected at least two --outputs, and --format png or video")
+        if not self.outputs or len(set(self.outputs)) < len(self.outputs):
+            raise UserError(f"--outputs {' '.join(self.outputs)}: expected at least one, and none of them twice")
+        if self.size is not None and not re.fullmatch(r"[0-9]{1,5}(x[0-9]{1,5})?", self.size):
+            raise UserError(f"--size {self.size}: expected WIDTH or WIDTHxHEIGHT in pixels")
 
 
 def main(arguments: Sequence[str]) -> None:
     """Render as the command line says."""
     options = command_line.parse(Render, arguments, "render")
+    options.check()
     run = open_run(options.run, options.stage)
-    split = get_split(run, options.split)
+    wanted = _shots(run, options)
     base = options.output or options.run / ("renders" if options.stage == "final" else "renders_coarse")
-    write_views(run, split, base / options.split)
-    print(f"wrote {len(split.names)} views to {base / options.split}")
+    make_folder(base / wanted.title)
+    write = _write_videos if options.format == "video" else _write_frames
+    write(run, wanted, base / wanted.title, options)
+
+
+def _shots(run: Run, options: Render) -> Shots:
+    if options.path == "dataset":
+        wanted = shots.of_split(run, options.split)
+    elif options.path in FLIGHTS:
+        first, last = options.times or (0.0, 1.0)
+        times = np.linspace(first, last, options.frames or FRAMES)
+        wanted = shots.of_flight(run, options.path, times, 0.5 if options.at is None else options.at)
+    else:
+        wanted = shots.of_file(run, Path(options.path))
+    width, height = wanted.size
+    if options.size:
+        sides = [int(side) for side in options.size.split("x")]
+        width, height = sides if len(sides) == 2 else (sides[0], max(1, round(height * sides[0] / width)))
+    longest = max(width * (len(options.outputs) if options.side_by_side else 1), height)
+    if min(width, height) < 1 or longest > LONGEST_SIDE:
+        source = f"--size {options.size}" if options.size else f"--path {options.path}"
+        raise UserError(f"{source}: {width}x{height} pixels; expected at least 1, and no picture over {LONGEST_SIDE}")
+    fps = wanted.fps if options.fps is None else options.fps
+    if not 0.1 <= fps <= 1000:
+        raise UserError(f"{fps:g} frames a second; expected --fps from 0.1 to 1000")
+    return (wanted.resized((width, height)) if options.size else wanted)._replace(fps=fps)
+
+
+def _write_frames(run: Run, wanted: Shots, folder: Path, options: Render) -> None:
+    draw: Callable[[RenderOutput], pictures.Pictures]
+    if options.side_by_side:
+        name = "-".join(options.outputs)
+        ranges = films.sampled_ranges(run, wanted.cameras, options.outputs, wanted.size)
+        kinds, draw = [name], lambda output: {name: display.side_by_side(output, options.outputs, ranges)}
+    else:
+        kinds = list(options.outputs)
+        draw = partial(pictures.as_floats if options.format == "exr" else pictures.as_integers, kinds=options.outputs)
+    suffix: Literal[".png", ".exr"] = ".exr" if options.format == "exr" else ".png"
+    new = pictures.write_frames(run, wanted, folder, kinds, draw, suffix)
+    there = len(wanted.names) - new
+    print(f"wrote {new} views to {folder}{f'; {there} were there already' if there else ''}")
+
+
+def _write_videos(run: Run, wanted: Shots, folder: Path, options: Render) -> None:
+    groups = [options.outputs] if options.side_by_side else [(kind,) for kind in options.outputs]
+    shown = {folder / "-".join(kinds): kinds for kinds in groups}
+    files = films.write_videos(run, wanted.cameras, shown, size=wanted.size, fps=wanted.fps)
+    print(f"wrote {' and '.join(map(str, files))}")
 
 
 if __name__ == "__main__":

@@ -95,8 +95,8 @@ def _record(dataset: Dataset, options: Train, config: Config, start: Checkpoint)
             f"{folder}: {error}; expected finite values: lower the learning rates and --resume from the checkpoint"
         ) from None
     write_image(folder / runs.CONTACT_SHEET, contact_sheet(run))
-    write_run_video(run, folder / runs.VIDEO)
-    print(f"wrote {folder / runs.CONTACT_SHEET} and {folder / runs.VIDEO}")
+    video = write_run_video(run, folder / runs.VIDEO)
+    print(f"wrote {folder / runs.CONTACT_SHEET} and {video}")
     print(f"next: python -m l2dgs_jax.evaluate {folder}   or   python -m l2dgs_jax.render {folder}")
 
 

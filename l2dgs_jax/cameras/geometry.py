@@ -67,3 +67,18 @@ def resize(camera: Camera, factor: float | int) -> Camera:
     scale: Float[np.ndarray, "3 1"] = np.array([[factor], [factor], [1.0]])
     K = jnp.asarray(camera.K)
     return camera._replace(K=K * jnp.asarray(scale, K.dtype).reshape(*[1] * (K.ndim - 2), 3, 1))
+
+
+def reframe(cameras: Camera, size: tuple[int, int], wanted: tuple[int, int]) -> Camera:
+    """Cameras of images of one size, for images of another: enlarged or reduced until they fill it, the rest cut off.
+
+    Args:
+        cameras: one camera, or a batch of them.
+        size: width and height of their images, pixels.
+        wanted: likewise, of the images to come.
+    """
+    factor = max(new / old for new, old in zip(wanted, size, strict=True))
+    margins = [(new - factor * old) / 2 for new, old in zip(wanted, size, strict=True)]
+    K = np.array(resize(cameras, factor).K)
+    K[..., :2, 2] += np.asarray(margins, K.dtype)
+    return cameras._replace(K=K)  # type: ignore[arg-type]

@@ -97,7 +97,7 @@ def read_header(path: Path) -> Header:
 
 
 def write_image(path: Path, image: Shaped[np.ndarray, "H W *C"]) -> None:
-    """Write an 8-bit or 16-bit integer image whole or not at all; the ending of `path` says the format.
+    """Write an image of integers, or of floats to EXR, whole or not at all; the ending of `path` says the format.
 
     Raises:
         UserError: the file cannot be written.

@@ -75,8 +75,8 @@ def name_list(path: Path, content: dict[str, Any], key: str) -> list[str]:
     return [str(name) for name in value(path, content, key, list)]
 
 
-def numbers(path: Path, content: dict[str, Any], key: str, shape: tuple[int, ...]) -> Float64[np.ndarray, "..."]:
-    """The finite numbers of a key, as an array of that shape.
+def numbers(path: Path | str, content: dict[str, Any], key: str, shape: tuple[int, ...]) -> Float64[np.ndarray, "..."]:
+    """The finite numbers of a key, as an array of that shape; `path` may say where in the file.
 
     Raises:
         UserError: it is missing or something else.

@@ -103,6 +103,23 @@ def write(dataset: Dataset, folder: Path) -> None:
         clouds.write_ply(target / clouds.FILES[0], dataset.points, dataset.colors)
 
 
+def world_to_camera(source: str, key: str, matrix: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "4 4"]:
+    """The rigid matrix of a camera with OpenGL's axes to the world, inverted and with OpenCV's.
+
+    Args:
+        source: where it is from, for messages.
+        key: what it is called there.
+        matrix: camera to world.
+
+    Raises:
+        UserError: it is not rigid.
+    """
+    rotation(f"{source}: '{key}'", matrix[:3, :3])
+    if not np.allclose(matrix[3], [0, 0, 0, 1]):
+        raise UserError(f"{source}: the last row of '{key}' is {matrix[3]}; expected 0 0 0 1")
+    return np.linalg.inv(matrix @ _AXES)
+
+
 def _entries(folder: Path) -> tuple[dict[str, Entry], Lists, str | None]:
     """Every frame by name, the layout's own lists, and the point cloud that it names."""
     single = folder / "transforms.json"
@@ -188,10 +205,7 @@ def _pictures(folder: Path, files: dict[str, Path], downscale: int) -> dict[str,
 
 def _frame(name: str, path: Path, content: dict[str, Any], file: Path, time: float, picture: Picture) -> Frame:
     source = f"{path}, frame '{name}'"
-    matrix = numbers(path, content, "transform_matrix", (4, 4))
-    rotation(f"{source}: 'transform_matrix'", matrix[:3, :3])
-    if not np.allclose(matrix[3], [0, 0, 0, 1]):
-        raise UserError(f"{source}: the last row of 'transform_matrix' is {matrix[3]}; expected 0 0 0 1")
+    viewmat = world_to_camera(source, "transform_matrix", numbers(path, content, "transform_matrix", (4, 4)))
     if "w" in content and "h" in content:
         size = int(numbers(path, content, "w", ())), int(numbers(path, content, "h", ()))
     else:
@@ -199,7 +213,7 @@ def _frame(name: str, path: Path, content: dict[str, Any], file: Path, time: flo
     if min(size) < 1:
         raise UserError(f"{source}: 'w' and 'h' are {size}; expected positive numbers of pixels")
     K, lens = _intrinsics(path, source, content, size)
-    return Frame(name, source, np.linalg.inv(matrix @ _AXES), K, lens, size, time, picture, alpha="coverage")
+    return Frame(name, source, viewmat, K, lens, size, time, picture, alpha="coverage")
 
 
 def _intrinsics(

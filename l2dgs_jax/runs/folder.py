@@ -18,7 +18,7 @@ CHECKPOINT = "checkpoint.npz"
 COARSE = "coarse.npz"  # the state at the end of the coarse stage
 METRICS = "metrics.jsonl"
 CONTACT_SHEET = "contact_sheet.png"
-VIDEO = "video.mp4"
+VIDEO = "video"  # and the ending of its format
 
 
 def write_settings(folder: Path, scene: str, config: Config) -> None:

@@ -56,7 +56,7 @@ def evaluate(run: Run, split_name: str = "test") -> dict:
 
     def relit() -> Iterator[Float16[np.ndarray, "H W 3"]]:
         """The well-lit views, as compact as the data set's own; the low-light ones are scored on the way."""
-        for index, output in enumerate(views(run, split)):
+        for index, output in enumerate(views(run, split.cameras)):
             estimate = np.asarray(output.images.lowlight)
             lowlight.append(_compare(exposed(estimate, index), split.images, split, index))
             yield np.asarray(output.images.welllit, np.float16)

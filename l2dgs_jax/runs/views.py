@@ -1,22 +1,30 @@
-"""The views of a run's scene, rendered one after the other."""
+"""Views of a run, rendered one after the other."""
 
 from collections.abc import Iterator
 
 import jax
 from tqdm import tqdm
 
+from l2dgs_jax.cameras import select_camera
 from l2dgs_jax.data.dataset import Split
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.runs.run import Run
 from l2dgs_jax.runtime.prefetch import prefetch
-from l2dgs_jax.types import RenderOutput
+from l2dgs_jax.types import Camera, RenderOutput
 
 
-def views(run: Run, split: Split) -> Iterator[RenderOutput]:
-    """Render the views of `split` in order, as NumPy arrays, showing progress."""
-    renderer = run.renderer()
-    outputs = prefetch(lambda i: jax.device_get(renderer(split.camera(i))), range(len(split.names)))
-    yield from tqdm(outputs, total=len(split.names), desc="render", unit="view", dynamic_ncols=True)
+def views(run: Run, cameras: Camera, size: tuple[int, int] | None = None) -> Iterator[RenderOutput]:
+    """Render a batch of cameras in order, as NumPy arrays, showing progress.
+
+    Args:
+        run: the run.
+        cameras: the batch.
+        size: width and height of the images, pixels; the data set's if not given.
+    """
+    renderer = run.renderer(*size or (None, None))
+    count = len(cameras.time)
+    outputs = prefetch(lambda i: jax.device_get(renderer(select_camera(cameras, i))), range(count))
+    yield from tqdm(outputs, total=count, desc="render", unit="view", dynamic_ncols=True)
 
 
 def get_split(run: Run, name: str) -> Split:

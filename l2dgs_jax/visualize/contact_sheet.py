@@ -5,11 +5,21 @@ import numpy as np
 from jaxtyping import UInt8
 
 from l2dgs_jax.data.images import to_bytes
-from l2dgs_jax.model.rendering import expected_depth
+from l2dgs_jax.runs.pictures import Output
 from l2dgs_jax.runs.run import Run
-from l2dgs_jax.visualize.sheet import sheet, viridis
+from l2dgs_jax.visualize import display
+from l2dgs_jax.visualize.sheet import sheet
 
 COLUMNS = ("input", "re-lit low light", "well-lit", "truth", "L", "R", "B1", "B2", "depth")
+RENDERED: dict[str, Output] = {
+    "re-lit low light": "lowlight",
+    "well-lit": "welllit",
+    "L": "illumination",
+    "R": "reflectance",
+    "B1": "b1",
+    "B2": "b2",
+    "depth": "depth",
+}
 
 
 def contact_sheet(run: Run, rows: int = 4) -> UInt8[np.ndarray, "H W 3"]:
@@ -30,26 +40,22 @@ def contact_sheet(run: Run, rows: int = 4) -> UInt8[np.ndarray, "H W 3"]:
     renderer = run.renderer()
     outputs = [jax.device_get(renderer(split.camera(i))) for i in chosen]
 
-    exponents = np.stack([output.images.attenuation for output in outputs])
-    depths = np.stack([expected_depth(output) for output in outputs])
-    coloured = {"B1": exponents[..., 0], "B2": exponents[..., 1], "depth": depths}
-    ranges = {name: np.percentile(values, (2, 98)) for name, values in coloured.items()}
+    ranges = display.ranges(outputs)
     columns = [name for name in COLUMNS if name != "truth" or split.welllit is not None]
-    headings = [f"{name} {ranges[name][0]:.5g}-{ranges[name][1]:.5g}" if name in ranges else name for name in columns]
+    headings = [_heading(name, ranges) for name in columns]
 
     lines = []
     kind = "held out" if held_out else "trained on"
     for row, i in enumerate(chosen):
-        images = outputs[row].images
-        pictures = {
-            "input": to_bytes(split.images[i]),
-            "re-lit low light": to_bytes(images.lowlight),
-            "well-lit": to_bytes(images.welllit),
-            "L": to_bytes(np.repeat(images.illumination[..., None], 3, axis=-1)),
-            "R": to_bytes(images.reflectance),
-        } | {name: viridis(values[row], *ranges[name]) for name, values in coloured.items()}
+        pictures = {name: display.shown(outputs[row], kind, ranges) for name, kind in RENDERED.items()}
+        pictures["input"] = to_bytes(split.images[i])
         if split.welllit is not None:
             pictures["truth"] = to_bytes(split.welllit[i])
         caption = f"{split.names[i]}, time {split.cameras.time[i]:.2f}, {kind}"
         lines.append((caption, [pictures[name] for name in columns]))
     return sheet(headings, lines)
+
+
+def _heading(name: str, ranges: display.Ranges) -> str:
+    span = ranges.get(RENDERED[name]) if name in RENDERED else None
+    return f"{name} {span[0]:.5g}-{span[1]:.5g}" if span else name

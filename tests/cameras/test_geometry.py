@@ -6,7 +6,7 @@ import pytest
 from jax.test_util import check_grads
 from scipy.spatial.transform import Rotation
 
-from l2dgs_jax.cameras import camera_centres, camera_extent, median_depth, resize, select_camera
+from l2dgs_jax.cameras import camera_centres, camera_extent, median_depth, reframe, resize, select_camera
 from l2dgs_jax.types import Camera
 
 
@@ -45,6 +45,20 @@ def test_a_resized_camera_sees_the_same():
     batch = resize(cameras(CENTRES), 0.5).K
     np.testing.assert_allclose(batch[:, 1, 1], 7.5)
     np.testing.assert_allclose(batch[:, 2], [[0, 0, 1]] * 5)
+
+
+@pytest.mark.parametrize("wanted", [(32, 24), (16, 12), (40, 12), (7, 30), (1, 1)])
+def test_a_reframed_camera_sees_a_part_of_the_same_undistorted(wanted):
+    camera, size = select_camera(cameras(CENTRES), 2), (16, 12)
+    K = reframe(camera, size, wanted).K
+    factor = max(wanted[0] / size[0], wanted[1] / size[1])
+    np.testing.assert_allclose(K[:2, :2], factor * camera.K[:2, :2])
+    corners = np.linalg.inv(K) @ np.array([[0, 0, 1], [*wanted, 1]]).T
+    seen = (camera.K @ corners)[:2].T
+    assert (seen[0] >= -1e-9).all()
+    assert (seen[1] <= np.array(size) + 1e-9).all()
+    np.testing.assert_allclose(seen.mean(0), np.array(size) / 2)
+    assert np.isclose(seen[1] - seen[0], size).any()
 
 
 def test_the_median_depth_is_that_of_the_points_in_front():

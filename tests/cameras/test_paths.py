@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from l2dgs_jax.cameras.paths import space_time_path
+from l2dgs_jax.cameras import camera_centres
+from l2dgs_jax.cameras.paths import centre_of_attention, interpolate, orbit, space_time_path, spiral
 from l2dgs_jax.types import Camera
 
 
@@ -90,3 +91,86 @@ def test_path_of_a_camera_that_stands_still():
     cameras = Camera(np.tile(np.eye(4), (5, 1, 1)), np.tile(np.eye(3), (5, 1, 1)), np.linspace(0, 1, 5))
     path = space_time_path(cameras, 12)
     np.testing.assert_allclose(path.viewmat, np.tile(np.eye(4), (12, 1, 1)), atol=1e-12)
+
+
+def watching(centres, target, up=(0.0, 0, 1)):
+    """Cameras that look at a point, in the order of their instants."""
+    centres = np.asarray(centres, float)
+    forward = (target - centres) / np.linalg.norm(target - centres, axis=-1, keepdims=True)
+    right = np.cross(forward, up)
+    right /= np.linalg.norm(right, axis=-1, keepdims=True)
+    viewmat = np.tile(np.eye(4), (len(centres), 1, 1))
+    viewmat[:, :3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
+    viewmat[:, :3, 3] = -np.einsum("fij,fj->fi", viewmat[:, :3, :3], centres)
+    K = np.tile(np.array([[14.0, 0, 8], [0, 14, 6], [0, 0, 1]]), (len(centres), 1, 1))
+    return Camera(viewmat, K, np.linspace(0, 1, len(centres)))
+
+
+def ring(angles, height=1.0):
+    return np.stack([4 * np.cos(angles), 4 * np.sin(angles), np.full(len(angles), height)], -1)
+
+
+TARGET = np.array([0.3, -0.2, 0.1])
+AROUND = watching(ring(np.linspace(0, 6, 30)) + TARGET, TARGET)
+IN_FRONT = watching(ring(np.linspace(-0.4, 0.6, 30)) + TARGET, TARGET)
+TRIPOD = watching(np.tile([[4.0, 0, 1]], (12, 1)) + TARGET, TARGET)
+DEPTH = float(np.hypot(4, 1))
+every_rig = pytest.mark.parametrize("cameras", [AROUND, IN_FRONT, TRIPOD], ids=["around", "in front", "tripod"])
+
+
+@every_rig
+@pytest.mark.parametrize("path", [spiral, orbit])
+def test_a_flight_keeps_its_distance_and_what_is_looked_at_in_the_middle(cameras, path):
+    times = np.linspace(0.2, 0.7, 25)
+    flight = path(cameras, DEPTH, times)
+    np.testing.assert_allclose(flight.time, times)
+    np.testing.assert_allclose(np.linalg.det(flight.viewmat), 1)
+    seen = flight.viewmat[:, :3, :3] @ TARGET + flight.viewmat[:, :3, 3]
+    np.testing.assert_allclose(seen[:, :2], 0, atol=0.02 * DEPTH)
+    assert (np.abs(seen[:, 2] - DEPTH) < 0.15 * DEPTH).all()
+    assert (flight.viewmat[:, 1, 2] < -0.5).all()  # the world's up is up
+    assert np.linalg.norm(np.ptp(camera_centres(flight.viewmat), axis=0)) > 0.05 * DEPTH
+    np.testing.assert_allclose(flight.viewmat[0], flight.viewmat[-1], atol=1e-9)  # it ends where it began
+    assert np.linalg.norm(np.diff(camera_centres(flight.viewmat), axis=0), axis=-1).max() < 0.5 * DEPTH
+
+
+@pytest.mark.parametrize(("cameras", "first", "last"), [(AROUND, -np.pi, np.pi), (IN_FRONT, -0.4, 0.6)])
+def test_an_orbit_goes_around_only_where_the_views_do(cameras, first, last):
+    level = camera_centres(orbit(cameras, DEPTH, np.linspace(0, 1, 101)).viewmat) - TARGET
+    angles = np.arctan2(level[:, 1], level[:, 0])
+    np.testing.assert_allclose([angles.min(), angles.max()], [first, last], atol=0.07)
+    np.testing.assert_allclose(level[:, 2], 1, atol=0.1)
+
+
+@every_rig
+@pytest.mark.parametrize(
+    "path", [spiral, orbit, lambda cameras, depth, times: interpolate(cameras, times)], ids=["spiral", "orbit", "inter"]
+)
+def test_a_path_moves_with_the_world(cameras, path):
+    turn, shift, scale = Rotation.from_rotvec([0.3, -1.1, 0.6]).as_matrix(), np.array([5.0, -2, 1]), 7.0
+    times = np.linspace(0, 1, 9)
+
+    def moved(viewmat):
+        new = viewmat.copy()
+        new[:, :3, :3] = viewmat[:, :3, :3] @ turn.T
+        new[:, :3, 3] = scale * viewmat[:, :3, 3] - new[:, :3, :3] @ shift
+        return new
+
+    there = path(cameras._replace(viewmat=moved(cameras.viewmat)), scale * DEPTH, times)
+    np.testing.assert_allclose(there.viewmat, moved(path(cameras, DEPTH, times).viewmat), atol=1e-8)
+
+
+def test_the_centre_of_attention_is_where_the_axes_meet_or_else_as_far_as_the_scene():
+    np.testing.assert_allclose(centre_of_attention(AROUND, 0.9 * DEPTH), TARGET, atol=0.1)
+    np.testing.assert_allclose(centre_of_attention(TRIPOD, DEPTH), TARGET, atol=1e-9)
+    side_by_side = Camera(np.tile(np.eye(4), (5, 1, 1)), np.tile(np.eye(3), (5, 1, 1)), np.linspace(0, 1, 5))
+    side_by_side.viewmat[:, 0, 3] = np.arange(5) - 2
+    np.testing.assert_allclose(centre_of_attention(side_by_side, 3.0), [0, 0, 3], atol=1e-9)
+
+
+def test_all_in_one_row_or_overhead_still_makes_an_orbit():
+    above = watching([[0.01 * i, 0, 4] for i in range(5)], np.zeros(3), up=(0.0, 1, 0))
+    path = orbit(above, 4.0, np.linspace(0, 1, 7))
+    assert np.isfinite(path.viewmat).all()
+    seen = path.viewmat[:, 2, 3]
+    np.testing.assert_allclose(seen, 4, atol=0.5)

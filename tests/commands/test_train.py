@@ -20,6 +20,7 @@ from l2dgs_jax.errors import UserError
 from l2dgs_jax.runs import checkpoints, open_run
 from l2dgs_jax.runtime import command_line, devices
 from l2dgs_jax.training import engine
+from l2dgs_jax.visualize.video import video_path
 
 TINY = [
     "--coarse-steps=5",
@@ -71,7 +72,7 @@ def test_a_run_leaves_what_it_promises(finished):
     assert metrics[-1]["stage"] == "fine"
     assert np.isfinite([metrics[-1]["loss"], metrics[-1]["psnr"]]).all()
     assert cv2.imread(str(folder / runs.CONTACT_SHEET)).std() > 1
-    assert cv2.VideoCapture(str(folder / runs.VIDEO)).get(cv2.CAP_PROP_FRAME_COUNT) > 24
+    assert cv2.VideoCapture(str(video_path(folder / runs.VIDEO))).get(cv2.CAP_PROP_FRAME_COUNT) > 24
     assert int(open_run(folder, "coarse").state.step) == 5
     assert not list(folder.glob("*.tmp*"))
     assert "12/12" in done.stderr

@@ -1,4 +1,4 @@
-"""Contact sheet, video, and the files they are written to."""
+"""Contact sheet, and the files that pictures are written to."""
 
 import dataclasses
 
@@ -10,12 +10,10 @@ import numpy as np
 import pytest
 
 from l2dgs_jax.cameras.geometry import select_camera
-from l2dgs_jax.cameras.paths import space_time_path
 from l2dgs_jax.data import images
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.visualize.contact_sheet import COLUMNS, contact_sheet
 from l2dgs_jax.visualize.sheet import CELL_WIDTHS, GAP, STRIP, cell, viridis
-from l2dgs_jax.visualize.video import VIDEO_RATE, VIDEO_SECONDS, write_run_video, write_video
 
 
 @pytest.fixture(scope="module")
@@ -84,58 +82,6 @@ def test_wide_pictures_are_reduced_in_the_contact_sheet():
     shown = cell(np.full((300, 1000, 3), 77, np.uint8))
     assert shown.shape == (120, 400, 3)
     assert (shown == 77).all()
-
-
-def test_video_plays_and_moves(run, tmp_path):
-    path = tmp_path / "video.mp4"
-    write_run_video(run, path)
-    frames, rate = decode(path)
-    assert len(frames) == VIDEO_SECONDS * VIDEO_RATE
-    assert rate == VIDEO_RATE
-    assert frames[0].shape == (run.dataset.height, 2 * run.dataset.width, 3)
-    assert frames.std(axis=(1, 2, 3)).min() > 1
-    assert frames.std(axis=0).max() > 1
-    camera = select_camera(space_time_path(run.dataset.train.cameras, len(frames)), 50)
-    images = run.renderer()(camera).images
-    expected = 255 * np.hstack([images.lowlight, images.welllit])
-    assert np.abs(frames[50] - expected).mean() < 12  # the codec is lossy
-
-
-def decode(path):
-    capture = cv2.VideoCapture(str(path))
-    frames = []
-    while (read := capture.read())[0]:
-        frames.append(cv2.cvtColor(read[1], cv2.COLOR_BGR2RGB))
-    return np.stack(frames).astype(float), capture.get(cv2.CAP_PROP_FPS)
-
-
-def test_video_of_odd_size_keeps_every_pixel_and_its_colour(tmp_path):
-    ramp = np.linspace(0, 255, 33).astype(np.uint8)
-    picture = np.zeros((21, 33, 3), np.uint8)
-    picture[..., 0], picture[..., 2] = ramp, 100
-    write_video(tmp_path / "odd.mp4", iter([picture] * 7), 10)
-    frames, _ = decode(tmp_path / "odd.mp4")
-    assert frames.shape == (7, 22, 34, 3)
-    assert np.abs(frames[:, :21, :33] - picture).mean() < 6
-    assert [p.name for p in tmp_path.iterdir()] == ["odd.mp4"]
-
-
-def test_video_without_codec_is_a_clear_error(tmp_path, monkeypatch):
-    class Broken:
-        def __init__(self, *arguments):
-            pass
-
-        def isOpened(self):
-            return False
-
-        def release(self):
-            pass
-
-    monkeypatch.setattr(cv2, "VideoWriter", Broken)
-    monkeypatch.setattr(cv2, "VideoWriter_fourcc", lambda *code: 0, raising=False)
-    with pytest.raises(UserError, match=r"video\.mp4.*expected an OpenCV with the mp4v codec"):
-        write_video(tmp_path / "video.mp4", iter([np.zeros((4, 4, 3), np.uint8)]), 10)
-    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("shape", [(5, 7), (5, 7, 3)])

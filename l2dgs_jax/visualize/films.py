@@ -1,0 +1,84 @@
+"""Videos of a run."""
+
+import contextlib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from l2dgs_jax.cameras import select_camera
+from l2dgs_jax.cameras.paths import space_time_path
+from l2dgs_jax.runs.pictures import Output
+from l2dgs_jax.runs.run import Run
+from l2dgs_jax.runs.shots import RATE
+from l2dgs_jax.runs.views import views
+from l2dgs_jax.types import Camera
+from l2dgs_jax.visualize import display
+from l2dgs_jax.visualize.video import open_video, video_path
+
+SECONDS = 4
+SAMPLES = 8  # views that decide the range of colours
+
+
+def write_run_video(run: Run, stem: Path) -> Path:
+    """A short flight through space and time: the estimate of the dark input on the left, well-lit on the right.
+
+    Args:
+        run: the run.
+        stem: the file without its ending.
+
+    Returns:
+        The file.
+
+    Raises:
+        UserError: the file cannot be written.
+    """
+    cameras = space_time_path(run.dataset.train.cameras, SECONDS * RATE)
+    return write_videos(run, cameras, {stem: ("lowlight", "welllit")})[0]
+
+
+def write_videos(
+    run: Run,
+    cameras: Camera,
+    shown: Mapping[Path, Sequence[Output]],
+    *,
+    size: tuple[int, int] | None = None,
+    fps: float | int = RATE,
+) -> list[Path]:
+    """Write videos of the same cameras, whole or not at all.
+
+    Args:
+        run: the run.
+        cameras: a batch, a frame each.
+        shown: by the file without its ending, what is side by side in it.
+        size: width and height of each of these pictures, pixels; the data set's if not given.
+        fps: frames a second.
+
+    Returns:
+        The files.
+
+    Raises:
+        UserError: a file cannot be written.
+    """
+    width, height = size = size or (run.dataset.width, run.dataset.height)
+    ranges = sampled_ranges(run, cameras, [kind for kinds in shown.values() for kind in kinds], size)
+    with contextlib.ExitStack() as stack:
+        videos = []
+        for stem, kinds in shown.items():
+            videos.append((stack.enter_context(open_video(stem, (len(kinds) * width, height), fps)), kinds))
+        for output in views(run, cameras, size):
+            for add, kinds in videos:
+                add(display.side_by_side(output, kinds, ranges))
+    return [video_path(stem) for stem in shown]
+
+
+def sampled_ranges(
+    run: Run, cameras: Camera, kinds: Sequence[Output], size: tuple[int, int] | None = None
+) -> display.Ranges:
+    """Ranges of colours from a few of the cameras, before all of them are rendered; none if no kind needs one."""
+    if not set(kinds) & set(display.COLOURED):
+        return {}
+    renderer = run.renderer(*size or (None, None))
+    chosen = np.unique(np.linspace(0, len(cameras.time) - 1, SAMPLES).round().astype(int))
+    return display.ranges([jax.device_get(renderer(select_camera(cameras, int(i)))) for i in chosen])
