@@ -16,7 +16,7 @@ def views(run: Run, split: Split) -> Iterator[RenderOutput]:
     """Render the views of `split` in order, as NumPy arrays, showing progress."""
     renderer = run.renderer()
     outputs = prefetch(lambda i: jax.device_get(renderer(split.camera(i))), range(len(split.names)))
-    yield from tqdm(outputs, total=len(split.names), desc="render", unit="view", dynamic_ncols=True)
+    yield from tqdm(outputs, total=len(split.names), desc="render", unit="view", dynamic_ncols=True, disable=None)
 
 
 def get_split(run: Run, name: str) -> Split:
