@@ -15,7 +15,7 @@ import os
 import sys
 import time
 from collections.abc import Callable, Iterator
-from typing import Any, TextIO
+from typing import Any
 
 from tqdm import tqdm
 
@@ -33,7 +33,7 @@ def choose(quiet: bool = False, as_json: bool = False) -> Iterator[Display]:
     if as_json:
         output = sys.stdout
         with contextlib.redirect_stdout(sys.stderr):
-            yield lambda event, **facts: _print_json(output, event, facts)
+            yield lambda event, **facts: print(_as_json(event, facts), end="", file=output, flush=True)
     elif quiet:
         with open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere):
             yield lambda event, **facts: None
@@ -44,10 +44,11 @@ def choose(quiet: bool = False, as_json: bool = False) -> Iterator[Display]:
         yield _Log()
 
 
-def _print_json(output: TextIO, event: str, facts: dict[str, Any]) -> None:
-    if event != "step":
-        line = json.dumps(facts if event == "metrics" else {"event": event} | facts)
-        print(f"{line}\n", end="", file=output, flush=True)  # in one piece: threads tell things too
+def _as_json(event: str, facts: dict[str, Any]) -> str:
+    """An object and its newline, to be printed in one piece: threads tell things too."""
+    if event == "step":
+        return ""
+    return json.dumps(facts if event == "metrics" else {"event": event} | facts) + "\n"
 
 
 class _Bar:

@@ -35,9 +35,7 @@ def test_a_file_that_cannot_take_its_place_is_a_clear_error_and_leaves_nothing_b
             temporary.write_text("half")
             raise OSError(28, "No space left on device")
 
-    with pytest.raises(
-        UserError, match=r"file\.txt: cannot be written \(No space left on device\); expected more room"
-    ):
+    with pytest.raises(UserError, match=r"file\.txt: cannot be written \(No space left on device\); .* room"):
         fill_the_disk()
     assert not list(tmp_path.iterdir())
 

@@ -11,7 +11,7 @@ from l2dgs_jax.runtime.memory import memory_errors
 @pytest.mark.parametrize("demand", [lambda: np.empty(2**60, np.uint8), lambda: jax.numpy.zeros(2**55, np.uint8)])
 def test_what_numpy_and_jax_raise_is_one_sentence(demand):
     with (
-        pytest.raises(UserError, match="^out of memory here; expected less$") as caught,
+        pytest.raises(UserError, match=r"^out of memory here; expected less$") as caught,
         memory_errors(lambda: "here", "less"),
     ):
         demand()
