@@ -50,7 +50,7 @@ def append_line(path: Path, line: str) -> None:
 
 def flush(path: Path) -> None:
     """Have a file, or what a folder lists, on the disk itself, where a power cut leaves it whole."""
-    descriptor = os.open(path, os.O_RDONLY)
+    descriptor = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)
     try:
         os.fsync(descriptor)
     finally:

@@ -14,7 +14,8 @@ STOPPING = (signal.SIGINT, signal.SIGTERM)
 def stop_requests(notice: Callable[[], None]) -> Iterator[Callable[[], int | None]]:
     """A function that says which signal, if any, has asked the block to stop; a SIGINT after it ends the process.
 
-    Signals that the process ignores, as `nohup` has it, stay ignored. Only the main thread can enter.
+    Signals that the process ignores, as shells have it for what runs in the background, stay ignored. Only the main
+    thread can enter.
 
     Args:
         notice: called once, when the first signal arrives, from a thread of its own.
