@@ -24,7 +24,6 @@ from l2dgs_jax.training.step import TrainState
 
 VERSION = 2  # of the files; those of version 1 have no version and no halvings
 
-
 # What a reader of zip, npy and JSON stumbles over in a file that is not what it should be.
 DAMAGE = (
     OSError,
