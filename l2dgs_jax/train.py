@@ -1,26 +1,33 @@
 """`python -m l2dgs_jax.train SCENE`: train a scene and leave a run folder with checkpoints, metrics and pictures."""
 
+import contextlib
 import dataclasses
-from collections.abc import Sequence
+import shlex
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import jax
 import tyro
-from tqdm import tqdm
 
 from l2dgs_jax import runs
 from l2dgs_jax.config import PRESETS, Config
 from l2dgs_jax.data import Dataset, load_dataset
 from l2dgs_jax.data.images import write_image
-from l2dgs_jax.errors import UserError
-from l2dgs_jax.runs import Checkpoint, Recorder, Run, checkpoints
+from l2dgs_jax.errors import DISK_FULL, Interrupted, UserError
+from l2dgs_jax.runs import Checkpoint, Run, displays
 from l2dgs_jax.runs.advice import misfit
+from l2dgs_jax.runs.displays import Display
+from l2dgs_jax.runs.divergence import standing
+from l2dgs_jax.runs.persistence import LESS_MEMORY, fit_in_folder
 from l2dgs_jax.runtime import command_line, devices, distributed
 from l2dgs_jax.runtime.distributed import Hosts
-from l2dgs_jax.runtime.files import is_taken
-from l2dgs_jax.training import DivergedError, Progress, initial_state, resolve
+from l2dgs_jax.runtime.files import is_taken, new_folder
+from l2dgs_jax.runtime.locks import locked
+from l2dgs_jax.runtime.memory import memory_errors
+from l2dgs_jax.runtime.signals import stop_requests
+from l2dgs_jax.training import initial_state, resolve
 from l2dgs_jax.visualize import contact_sheet, write_run_video
 
 
@@ -37,6 +44,8 @@ class Train:
         resume: continue the run in the output folder from its last checkpoint.
         devices: how many devices the views of a step are spread over; each core of a processor is one. If not given,
             as many as share them evenly.
+        quiet: show nothing but warnings and errors.
+        json: print one JSON object a line, docs/training.md says which.
         hosts: several processes.
     """
 
@@ -45,6 +54,8 @@ class Train:
     output: Path | None = None
     resume: bool = False
     devices: int | None = None
+    quiet: bool = False
+    json: bool = False
     hosts: Annotated[Hosts, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Hosts)
     config: Annotated[Config, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Config)
 
@@ -59,63 +70,74 @@ def main(arguments: Sequence[str]) -> None:
 
 
 def _train(options: Train) -> None:
-    folder, config = options.output, options.config
+    folder, config, first = options.output, options.config, jax.process_index() == 0
     assert folder is not None
     _check_devices(options)
-    dataset = load_dataset(options.scene, config.downscale, config.format, config.held_out, config.frame_memory)
-    config = resolve(config, dataset)
-    if options.resume:
-        start = checkpoints.load(folder / runs.CHECKPOINT, config, len(dataset.train.names))
-    else:
-        start = Checkpoint(initial_state(dataset, config))  # what cannot start should leave no folder
-    distributed.barrier("everything is read")
-    if jax.process_index() > 0:
-        runs.fit(dataset, config, start=start, device_count=options.devices)
-    else:
-        _record(dataset, options, config, start)
-    distributed.barrier("the run is finished")
+    with contextlib.ExitStack() as stack:
+        if options.resume and first:
+            stack.enter_context(locked(folder))
+        with memory_errors(lambda: "before the first step", LESS_MEMORY):
+            dataset = load_dataset(options.scene, config.downscale, config.format, config.held_out, config.frame_memory)
+            config = resolve(config, dataset)
+            # What cannot start should leave no folder.
+            start = standing(folder, dataset, config) if options.resume else Checkpoint(initial_state(dataset, config))
+        distributed.barrier("everything is read")
+        if first:
+            if not options.resume:
+                with new_folder(folder) as place:
+                    runs.write_settings(place, options.scene, config)
+                stack.enter_context(locked(folder))
+            with displays.choose(options.quiet, options.json) as display, _end_told(display):
+                _record(dataset, options, config, start, display)
+        else:
+            runs.fit(dataset, config, start=start, device_count=options.devices)
+        distributed.barrier("the run is finished")
 
 
-def _record(dataset: Dataset, options: Train, config: Config, start: Checkpoint) -> None:
+def _record(dataset: Dataset, options: Train, config: Config, start: Checkpoint, display: Display) -> None:
     """Train, leave the steps in the run folder, and show what came of them."""
     folder = options.output
     assert folder is not None
-    if not options.resume:
-        runs.write_settings(folder, options.scene, config)
+    display("start", scene=dataset.name, run=str(folder), step=int(start.state.step), steps=config.steps)
     for note in dataset.notes:
         print(f"note: {note}")
     warning = misfit(dataset, config)
     if warning:
         print(f"warning: {warning}")
     print(f"{dataset.name}: {len(dataset.train.names)} frames of {dataset.width}x{dataset.height}; run folder {folder}")
-    try:
-        run = _fit_with_progress(dataset, options, config, start)
-    except DivergedError as error:
-        raise UserError(
-            f"{folder}: {error}; expected finite values: lower the learning rates and --resume from the checkpoint"
-        ) from None
+    run = _fit(dataset, options, config, start, display)
     write_image(folder / runs.CONTACT_SHEET, contact_sheet(run))
     video = write_run_video(run, folder / runs.VIDEO)
     print(f"wrote {folder / runs.CONTACT_SHEET} and {video}")
     print(f"next: python -m l2dgs_jax.evaluate {folder}   or   python -m l2dgs_jax.render {folder}")
 
 
-def _fit_with_progress(dataset: Dataset, options: Train, config: Config, start: Checkpoint) -> Run:
-    folder, done = options.output, int(start.state.step)
+def _fit(dataset: Dataset, options: Train, config: Config, start: Checkpoint, display: Display) -> Run:
+    """Train, and say how to go on if that is stopped."""
+    folder = options.output
     assert folder is not None
-    record = Recorder(folder, config, done)
-    with tqdm(total=config.steps, initial=done, unit="step", dynamic_ncols=True) as bar:
+    notice = "stopping after this step; Ctrl-C now stops at once, and loses the steps since the last checkpoint"
+    command = shlex.join(["python", "-m", "l2dgs_jax.train", options.scene, "--output", str(folder), "--resume"])
+    try:
+        with stop_requests(lambda: display("stopping", message=notice)) as stopping:
+            return fit_in_folder(folder, dataset, config, start, display, stopping, options.devices)
+    except Interrupted as stop:
+        raise Interrupted(f"{stop}; go on with: {command}", stop.code) from None
+    except UserError as error:
+        if error.code != DISK_FULL:
+            raise
+        raise UserError(f"{error}, then go on with: {command}", DISK_FULL) from None
 
-        def on_step(progress: Progress) -> None:
-            bar.update()
-            line = record(progress)
-            if line:
-                bar.set_description(line["stage"])
-                bar.set_postfix_str(
-                    f"loss {line['loss']:.3f}, low-light {line['psnr']:.1f} dB, {line['gaussians']} Gaussians"
-                )
 
-        return runs.fit(dataset, config, on_step, start=start, device_count=options.devices)
+@contextlib.contextmanager
+def _end_told(display: Display) -> Iterator[None]:
+    """Tell programs how it ended; people read the error itself."""
+    try:
+        yield
+    except (UserError, Interrupted) as end:
+        display("end", code=end.code, reason=str(end))
+        raise
+    display("end", code=0)
 
 
 def _parse(arguments: Sequence[str]) -> Train:

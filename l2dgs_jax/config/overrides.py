@@ -49,7 +49,7 @@ def partition(configs: Sequence[Config]) -> tuple[StaticConfig, dict[str, list[A
     static = sorted(columns.keys() - TRACED)
     if static:
         raise ValueError(f"{static[0]} is {columns[static[0]]}; expected settings that differ in numbers only")
-    blanks = {name: _blank(_read(configs[0], name)) for name in columns}
+    blanks = {name: _blank(read(configs[0], name)) for name in columns}
     return StaticConfig(replace(configs[0], blanks), tuple(sorted(columns))), columns
 
 
@@ -94,16 +94,17 @@ def checked(name: str, value: Any) -> Any:
 
 def outline(config: Config) -> Config:
     """The settings with every number of `TRACED` blanked: equal for scenes that can share a compiled program."""
-    return replace(config, {name: _blank(_read(config, name)) for name in TRACED})
+    return replace(config, {name: _blank(read(config, name)) for name in TRACED})
 
 
 def differences(configs: Sequence[Config]) -> dict[str, list[Any]]:
     """The settings in which some of the configs differ, each with its value in every one of them."""
-    values = {name: [_read(config, name) for config in configs] for name in _KINDS}
+    values = {name: [read(config, name) for config in configs] for name in _KINDS}
     return {name: column for name, column in values.items() if any(value != column[0] for value in column)}
 
 
-def _read(config: Config, name: str) -> Any:
+def read(config: Config, name: str) -> Any:
+    """The setting of a dotted name."""
     value: Any = config
     for part in name.split("."):
         value = getattr(value, part)

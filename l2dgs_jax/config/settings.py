@@ -214,6 +214,7 @@ class Config:
     sh_warmup: int | None = 1000  # steps between activating one more SH band; None: all by half of the run
     drop: Number = 0.0  # share of the Gaussians that a step leaves out at random, at the end of the run
     checkpoint_every: int = 500  # steps
+    keep_checkpoints: int = 2  # the last ones, in case that the very last is damaged
     # Share of the views that lie between two frames of the video, drawn by optical flow (training/inbetweens.py)
     inbetweens: float = 0.0
     frame_memory: float = 4.0  # GiB that a scene's frames may take; beyond it they lie in temporary files
@@ -227,14 +228,22 @@ class Config:
         """Length of the whole run."""
         return self.coarse_steps + self.fine_steps
 
+    def stage_of(self, step: int) -> str:
+        """The stage that the step of that number, from 1, belongs to."""
+        return "coarse" if step <= self.coarse_steps else "fine"
+
     def check_counts(self) -> None:
         """Complain of numbers that make no training.
 
         Raises:
-            UserError: a number of steps is negative, or both are zero; a step has no views; or no number of steps lies
-                between checkpoints.
+            UserError: a number of steps is negative, or both are zero; a step has no views; no number of steps lies
+                between checkpoints; or none is kept.
         """
-        for name, count in (("--batch-size", self.batch_size), ("--checkpoint-every", self.checkpoint_every)):
+        for name, count in (
+            ("--batch-size", self.batch_size),
+            ("--checkpoint-every", self.checkpoint_every),
+            ("--keep-checkpoints", self.keep_checkpoints),
+        ):
             if count < 1:
                 raise UserError(f"{name} {count}: expected at least 1")
         if self.steps < 1 or min(self.coarse_steps, self.fine_steps) < 0:
@@ -242,7 +251,7 @@ class Config:
 
 
 # Settings of how a run is carried out, not of what it computes: they may change when it goes on.
-EXECUTION = frozenset({"checkpoint_every", "frame_memory"})
+EXECUTION = frozenset({"checkpoint_every", "frame_memory", "keep_checkpoints"})
 
 
 def to_dict(config: Config) -> dict:

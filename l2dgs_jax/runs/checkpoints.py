@@ -1,7 +1,12 @@
-"""Training states on disk: one .npz a state, written whole or not at all."""
+"""Training states on disk: one .npz a state, written whole or not at all, and the last few of them kept."""
 
+import contextlib
+import itertools
 import json
 import os
+import re
+import struct
+import warnings
 import zipfile
 from pathlib import Path
 from typing import NamedTuple
@@ -13,33 +18,101 @@ from numpy.lib import format as npy
 
 from l2dgs_jax.config import EXECUTION, Config, from_dict, to_dict
 from l2dgs_jax.errors import UserError
-from l2dgs_jax.runtime.files import replacing
+from l2dgs_jax.runtime.files import flush, replacing
 from l2dgs_jax.training.initial_state import state_shapes
 from l2dgs_jax.training.step import TrainState
 
+VERSION = 2  # of the files; those of version 1 have no version and no halvings
+
+# What a reader of zip, npy and JSON stumbles over in a file that is not what it should be.
+DAMAGE = (
+    OSError,
+    ValueError,
+    KeyError,
+    TypeError,
+    AttributeError,
+    EOFError,
+    NotImplementedError,
+    RuntimeError,
+    struct.error,
+    zipfile.BadZipFile,
+)
+
+
+class DamagedError(UserError):
+    """A file is no whole checkpoint."""
+
 
 class Checkpoint(NamedTuple):
-    """A training state and the size of the pair buffer that it ran with, if it has run."""
+    """Where a training stands.
+
+    Attributes:
+        state: its state.
+        pair_capacity: size of the pair buffer that it ran with, if it has run.
+        halvings: how often its learning rates were halved, because it diverged.
+    """
 
     state: TrainState
     pair_capacity: int | None = None
+    halvings: int = 0
 
 
-def save(path: Path, checkpoint: Checkpoint, config: Config) -> None:
-    """Write a state, one array after the other; a reader sees the old file or the new one.
+def save(path: Path, checkpoint: Checkpoint, config: Config, keep: int = 1) -> None:
+    """Write a state, one array after the other; it is on the disk before it takes the place of the one before it.
+
+    Args:
+        path: the file.
+        checkpoint: what to write.
+        config: the settings that it was trained with.
+        keep: how many files to keep, this one included; see `kept`.
 
     Raises:
         UserError: the file cannot be written.
     """
     leaves, _ = jax.tree_util.tree_flatten_with_path(checkpoint.state)
-    header = json.dumps({"config": to_dict(config), "pair_capacity": checkpoint.pair_capacity})
-    with replacing(path) as temporary, open(temporary, "wb") as file:
-        with zipfile.ZipFile(file, "w") as archive:
+    facts = {"version": VERSION, "pair_capacity": checkpoint.pair_capacity, "halvings": checkpoint.halvings}
+    header = json.dumps(facts | {"config": to_dict(config)})
+    with replacing(path) as temporary:
+        with zipfile.ZipFile(temporary, "w") as archive:
             _write(archive, "header", np.array(header))
             for key, leaf in leaves:
                 _write(archive, jax.tree_util.keystr(key), np.asarray(leaf))
-        file.flush()
-        os.fsync(file.fileno())
+        flush(temporary)
+        _make_way(path, keep)
+    with contextlib.suppress(OSError):  # where folders cannot be flushed
+        flush(path.parent)
+
+
+def kept(path: Path) -> list[Path]:
+    """The checkpoints that are there, the last one first: checkpoint.npz, checkpoint-1.npz, checkpoint-2.npz ..."""
+    name = re.compile(rf"{re.escape(path.stem)}-(\d+){re.escape(path.suffix)}")
+    earlier = {int(found[1]): file for file in path.parent.glob("*") if (found := name.fullmatch(file.name))}
+    return [*([path] if path.exists() else []), *(file for _, file in sorted(earlier.items()))]
+
+
+def load_last(path: Path, config: Config, num_frames: int, skip: int = 0) -> Checkpoint:
+    """Read the last checkpoint that is whole, with a warning of those after it.
+
+    Args:
+        path: where the last one should be.
+        config: see `load`.
+        num_frames: see `load`.
+        skip: go further back by so many, but not beyond the first that was kept.
+
+    Raises:
+        UserError: none is whole, or as `load`.
+    """
+    files, damaged = kept(path) or [path], []
+    for file in files[min(skip, len(files) - 1) :]:
+        try:
+            checkpoint = load(file, config, num_frames)
+        except DamagedError as error:
+            damaged.append(error)
+        else:
+            for damage in damaged:
+                warnings.warn(f"{damage}; {file.name}, of step {checkpoint.state.step}, is used instead", stacklevel=2)
+            return checkpoint
+    raise damaged[0]
 
 
 def load(path: Path, config: Config, num_frames: int) -> Checkpoint:
@@ -51,13 +124,19 @@ def load(path: Path, config: Config, num_frames: int) -> Checkpoint:
         num_frames: training frames of the scene.
 
     Raises:
-        UserError: the file is missing, incomplete, or of other settings.
+        UserError: the file is missing, of other settings, or of a later version.
+        DamagedError: it is incomplete.
     """
     leaves, treedef = jax.tree_util.tree_flatten_with_path(state_shapes(config, num_frames))
     expected = {jax.tree_util.keystr(key): leaf for key, leaf in leaves}
     try:
         with zipfile.ZipFile(path) as archive:
             header = json.loads(str(_read(archive, "header")))
+            version = header.get("version", 1)
+            if version > VERSION:
+                raise UserError(
+                    f"{path}: of version {version}; expected at most {VERSION}: a later l2dgs_jax has written it"
+                )
             written = to_dict(from_dict(header["config"]))  # with the defaults of settings that were added since
             difference = _first_difference(written, to_dict(config))
             if difference:
@@ -68,11 +147,25 @@ def load(path: Path, config: Config, num_frames: int) -> Checkpoint:
                     f"{path}: the array {misfit} is missing or has another shape; expected a checkpoint of this run"
                 )
             arrays = (jnp.asarray(_read(archive, name)) for name in expected)
-            return Checkpoint(jax.tree_util.tree_unflatten(treedef, arrays), header["pair_capacity"])
+            state = jax.tree_util.tree_unflatten(treedef, arrays)
+            return Checkpoint(state, header["pair_capacity"], header.get("halvings", 0))
     except FileNotFoundError:
         raise UserError(f"{path}: no such checkpoint; expected one that train wrote") from None
-    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile):
-        raise UserError(f"{path}: truncated or not a checkpoint; expected a whole file that train wrote") from None
+    except jax.errors.JaxRuntimeError:  # out of memory
+        raise
+    except DAMAGE:
+        raise DamagedError(f"{path}: truncated or not a checkpoint; expected a whole file that train wrote") from None
+
+
+def _make_way(path: Path, keep: int) -> None:
+    """Move what is to be kept one place back, and remove the rest."""
+    places = [path, *(path.with_name(f"{path.stem}-{index}{path.suffix}") for index in range(1, keep))]
+    for later, earlier in reversed(list(itertools.pairwise(places))):
+        if zipfile.is_zipfile(later):  # a truncated file should not push out a whole one
+            os.replace(later, earlier)
+    for file in kept(path):
+        if file not in places:
+            file.unlink()
 
 
 def _write(archive: zipfile.ZipFile, name: str, array: np.ndarray) -> None:

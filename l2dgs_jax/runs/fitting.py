@@ -6,6 +6,7 @@ from collections.abc import Callable
 from l2dgs_jax.config import Config
 from l2dgs_jax.data import Dataset
 from l2dgs_jax.runs.checkpoints import Checkpoint
+from l2dgs_jax.runs.divergence import with_lower_rates
 from l2dgs_jax.runs.run import Run
 from l2dgs_jax.runtime import devices
 from l2dgs_jax.training import Member, Progress, engine, initial_state, resolve
@@ -27,7 +28,7 @@ def fit(
         dataset: what was filmed, as `load_dataset` returns it. Settings of how a scene is read are taken from it.
         config: all other settings, such as one of `PRESETS`.
         on_step: called after every step; its argument is valid until it returns.
-        start: a state to go on from; a fresh one if not given.
+        start: where to go on from; the beginning if not given.
         device_count: how many devices the views of a step are spread over; as many as share them evenly if not given.
 
     Raises:
@@ -46,9 +47,10 @@ def fit(
     if dataset.source:
         config = dataclasses.replace(config, **dataset.source.settings)
     config = resolve(config, dataset)
-    state, pair_capacity = start or Checkpoint(initial_state(dataset, config))
-    member = Member(dataset.train, config, state)
-    for progress in engine.run([member], pair_capacity, mesh):
+    start = start or Checkpoint(initial_state(dataset, config))
+    state = start.state
+    member = Member(dataset.train, with_lower_rates(config, start.halvings), state)
+    for progress in engine.run([member], start.pair_capacity, mesh):
         if on_step:
             on_step(progress)
         state = progress.states

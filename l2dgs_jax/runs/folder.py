@@ -3,18 +3,19 @@
 import dataclasses
 import json
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from l2dgs_jax.config import Config, from_dict, to_dict
-from l2dgs_jax.data import load_dataset
+from l2dgs_jax.data import Dataset, load_dataset
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.runs import checkpoints
 from l2dgs_jax.runs.checkpoints import Checkpoint
 from l2dgs_jax.runs.run import Run
 from l2dgs_jax.runtime.files import is_taken, make_folder, write_json
+from l2dgs_jax.training import initial_state
 
 SETTINGS = "config.json"
-CHECKPOINT = "checkpoint.npz"
+CHECKPOINT = "checkpoint.npz"  # the last one; those before it are checkpoint-1.npz, checkpoint-2.npz ...
 COARSE = "coarse.npz"  # the state at the end of the coarse stage
 METRICS = "metrics.jsonl"
 CONTACT_SHEET = "contact_sheet.png"
@@ -76,7 +77,7 @@ def open_run(folder: str | Path, stage: Literal["final", "coarse"] = "final") ->
 
     Args:
         folder: that `train`, `sweep` or `save_run` wrote.
-        stage: "final" for the last checkpoint, "coarse" for the one at the end of the coarse stage.
+        stage: "final" for the last whole checkpoint, "coarse" for the one at the end of the coarse stage.
 
     Raises:
         UserError: settings, scene or checkpoint are missing or do not fit together.
@@ -84,8 +85,38 @@ def open_run(folder: str | Path, stage: Literal["final", "coarse"] = "final") ->
     folder = Path(folder)
     scene, config = read_settings(folder)
     path = folder / {"final": CHECKPOINT, "coarse": COARSE}[stage]
-    if not path.exists():
+    if not checkpoints.kept(path):
         raise UserError(f"{path}: no such checkpoint; expected a run that has got that far")
     dataset = load_dataset(scene, config.downscale, config.format, config.held_out, config.frame_memory)
-    state = checkpoints.load(path, config, len(dataset.train.names)).state
+    state = checkpoints.load_last(path, config, len(dataset.train.names)).state
     return Run(config, dataset, state, folder)
+
+
+def last_checkpoint(folder: Path, dataset: Dataset, config: Config, skip: int = 0) -> Checkpoint:
+    """Where the training of a run folder stands: at its last whole checkpoint, or before the first step.
+
+    Args:
+        folder: of the run.
+        dataset: its scene.
+        config: its settings, what they left to the data filled in.
+        skip: see `checkpoints.load_last`.
+
+    Raises:
+        UserError: no checkpoint is whole, or they are of other settings.
+    """
+    path = folder / CHECKPOINT
+    if not checkpoints.kept(path):
+        return Checkpoint(initial_state(dataset, config))
+    return checkpoints.load_last(path, config, len(dataset.train.names), skip)
+
+
+def read_metrics(folder: Path) -> list[dict[str, Any]]:
+    """The lines of a run's metrics, up to one that an interruption has torn."""
+    path = folder / METRICS
+    lines = []
+    for line in path.read_text(errors="replace").splitlines() if path.exists() else ():
+        try:
+            lines.append(json.loads(line))
+        except ValueError:
+            break
+    return lines

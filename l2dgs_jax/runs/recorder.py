@@ -7,28 +7,36 @@ from pathlib import Path
 from l2dgs_jax.config import Config
 from l2dgs_jax.runs import checkpoints
 from l2dgs_jax.runs.checkpoints import Checkpoint
-from l2dgs_jax.runs.folder import CHECKPOINT, COARSE, METRICS
+from l2dgs_jax.runs.divergence import rate_factor
+from l2dgs_jax.runs.folder import CHECKPOINT, COARSE, METRICS, read_metrics
 from l2dgs_jax.runtime import devices
+from l2dgs_jax.runtime.files import append_line, replacing
 from l2dgs_jax.training import Progress
 
 LOG_EVERY = 10  # steps between lines of the metrics file
 
 
 class Recorder:
-    """Records one member of a training in its run folder."""
+    """Records one member of a training in its run folder.
 
-    def __init__(self, folder: Path, config: Config, done: int):
+    Attributes:
+        step: the last step that it was told of.
+    """
+
+    def __init__(self, folder: Path, config: Config, done: int, halvings: int = 0):
         """Drop metrics after the step `done`, from a run that was interrupted after its last checkpoint.
 
         Args:
             folder: of the run, which exists.
             config: its settings, what they left to the data filled in.
             done: number of steps already taken.
+            halvings: see `Checkpoint`.
         """
-        self.folder, self.config, self.begun = folder, config, time.monotonic()
-        metrics = folder / METRICS
-        kept = [line for line in metrics.read_text().splitlines() if json.loads(line)["step"] <= done] if done else []
-        metrics.write_text("".join(f"{line}\n" for line in kept))
+        self.folder, self.config, self.halvings, self.begun = folder, config, halvings, time.monotonic()
+        self.step = self._saved = done
+        kept = [json.dumps(line) for line in read_metrics(folder) if line["step"] <= done]
+        with replacing(folder / METRICS) as temporary:
+            temporary.write_text("".join(f"{line}\n" for line in kept))
 
     def __call__(self, progress: Progress, member: int = 0) -> dict | None:
         """Write what is due after a step.
@@ -39,31 +47,42 @@ class Recorder:
 
         Returns:
             The line of metrics, if one was due.
+
+        Raises:
+            UserError: a file cannot be written.
         """
-        step, config = progress.step, self.config
-        last = step == config.steps
-        if step == config.coarse_steps:
-            self.save(progress, member, COARSE)
-        if step % config.checkpoint_every == 0 or last:
-            self.save(progress, member, CHECKPOINT)
-        if step % LOG_EVERY and not last:
-            return None
+        self.step, config = progress.step, self.config
+        last = self.step == config.steps
+        # Metrics first: those that are ahead of the last checkpoint are dropped when the run goes on from there.
+        line = self._line(progress, member) if self.step % LOG_EVERY == 0 or last else None
+        if line:
+            append_line(self.folder / METRICS, json.dumps(line))
+        if self.step == config.coarse_steps:
+            self._save(progress, member, COARSE, 1)
+        if self.step % config.checkpoint_every == 0 or last:
+            self.checkpoint(progress, member)
+        return line
+
+    def checkpoint(self, progress: Progress, member: int = 0) -> None:
+        """Write a checkpoint, unless that of this step was written already."""
+        if progress.step != self._saved:
+            self._save(progress, member, CHECKPOINT, self.config.keep_checkpoints)
+            self._saved = progress.step
+
+    def _save(self, progress: Progress, member: int, name: str, keep: int) -> None:
+        checkpoint = Checkpoint(devices.member(progress.states, member), progress.pair_capacity, self.halvings)
+        checkpoints.save(self.folder / name, checkpoint, self.config, keep)
+
+    def _line(self, progress: Progress, member: int) -> dict:
         report = devices.member(progress.report, member)
         alive = devices.member(progress.states.scene.alive, member)
         values = {"loss": report.loss, "psnr": report.psnr, **report.terms}
-        line = {
-            "step": step,
-            "stage": "coarse" if step <= config.coarse_steps else "fine",
+        return {
+            "step": progress.step,
+            "stage": self.config.stage_of(progress.step),
             "gaussians": int(alive.sum()),
             "pairs": int(report.pairs),
             **{name: round(float(value), 6) for name, value in values.items()},
+            "rate_factor": rate_factor(self.halvings),
             "seconds": round(time.monotonic() - self.begun, 2),
         }
-        with open(self.folder / METRICS, "a") as file:
-            file.write(json.dumps(line) + "\n")
-        return line
-
-    def save(self, progress: Progress, member: int, name: str) -> None:
-        """Write the member's state to the file of that name in the run folder."""
-        state = devices.member(progress.states, member)
-        checkpoints.save(self.folder / name, Checkpoint(state, progress.pair_capacity), self.config)

@@ -24,7 +24,7 @@ def views(run: Run, cameras: Camera, size: tuple[int, int] | None = None) -> Ite
     renderer = run.renderer(*size or (None, None))
     count = len(cameras.time)
     outputs = prefetch(lambda i: jax.device_get(renderer(select_camera(cameras, i))), range(count))
-    yield from tqdm(outputs, total=count, desc="render", unit="view", dynamic_ncols=True)
+    yield from tqdm(outputs, total=count, desc="render", unit="view", dynamic_ncols=True, disable=None)
 
 
 def get_split(run: Run, name: str) -> Split:

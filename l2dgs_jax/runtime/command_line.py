@@ -1,6 +1,7 @@
 """What the command lines share: parsing, errors in one sentence, the compilation cache, and huge pages."""
 
 import os
+import signal
 import sys
 import warnings
 from collections.abc import Callable, Sequence
@@ -10,7 +11,7 @@ from typing import Any, TypeVar
 import jax
 import tyro
 
-from l2dgs_jax.errors import UserError
+from l2dgs_jax.errors import Interrupted, UserError
 from l2dgs_jax.runtime import devices
 
 T = TypeVar("T")
@@ -19,7 +20,7 @@ T = TypeVar("T")
 def run(
     command: Callable[[Sequence[str]], None], arguments: Sequence[str] | None = None, *, huge_pages: bool = False
 ) -> None:
-    """Run a command: a user's mistake becomes one sentence on standard error and exit code 2.
+    """Run a command: whatever ends it early becomes one sentence on standard error and an exit code.
 
     Args:
         command: takes the arguments.
@@ -36,7 +37,13 @@ def run(
             command(sys.argv[1:] if arguments is None else arguments)
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
+        sys.exit(error.code)
+    except Interrupted as stop:
+        print(stop, file=sys.stderr)
+        sys.exit(stop.code)
+    except KeyboardInterrupt:
+        print("stopped", file=sys.stderr)
+        sys.exit(128 + signal.SIGINT)
 
 
 def _show_warning(message: Warning | str, *_: Any) -> None:

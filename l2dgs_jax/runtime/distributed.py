@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import jax
 from jax.experimental import multihost_utils
 
-from l2dgs_jax.errors import UserError
+from l2dgs_jax.errors import Interrupted, UserError
 
 
 @dataclass(frozen=True)
@@ -37,8 +37,8 @@ class Hosts:
 def process_group(hosts: Hosts) -> Iterator[None]:
     """Join the other processes, and part from them at the end; does nothing for one process.
 
-    If the others are not found or lost, or if the block raises, the process ends with exit code 2 and the reason on
-    standard error: it would wait for the others, or they for it.
+    If the others are not found or lost, or if the block raises, the process ends at once with the reason on standard
+    error, and exit code 2 unless what was raised has its own: it would wait for the others, or they for it.
 
     Raises:
         UserError: an option is missing or malformed.
@@ -66,7 +66,7 @@ def process_group(hosts: Hosts) -> Iterator[None]:
     with _last_words() as prepare:
         prepare(alone)
         # Past its own limit jaxlib ends the process with a stack trace: ours comes first.
-        patience = threading.Timer(hosts.timeout, _leave, [prepare, alone])
+        patience = threading.Timer(hosts.timeout, _leave, [prepare, f"error: {alone}"])
         patience.daemon = True
         patience.start()
         jax.distributed.initialize(
@@ -83,12 +83,14 @@ def process_group(hosts: Hosts) -> Iterator[None]:
         try:
             yield
         except UserError as error:
-            _leave(prepare, str(error))
+            _leave(prepare, f"error: {error}", error.code)
+        except Interrupted as stop:
+            _leave(prepare, str(stop), stop.code)
         except BaseException as error:
             # A broken connection comes as a ValueError too.
             if isinstance(error, jax.errors.JaxRuntimeError) or "Gloo" in str(error):
-                _leave(prepare, f"{lost} ({str(error).splitlines()[0]})")
-            _leave(prepare, "".join(traceback.format_exception(error)))
+                _leave(prepare, f"error: {lost} ({str(error).splitlines()[0]})")
+            _leave(prepare, f"error: {''.join(traceback.format_exception(error))}")
         jax.distributed.shutdown()
 
 
@@ -107,12 +109,12 @@ def _number(option: str, value: int | None, variable: str) -> int:
     return int(text)
 
 
-def _leave(prepare: Callable[[str], None], sentence: str) -> None:
+def _leave(prepare: Callable[[str], None], sentence: str, code: int = 2) -> None:
     """End at once: the usual end would wait for processes that may be gone."""
     prepare("")
     sys.stdout.flush()
-    print(f"error: {sentence}", file=sys.stderr, flush=True)
-    os._exit(2)
+    print(sentence, file=sys.stderr, flush=True)
+    os._exit(code)
 
 
 @contextlib.contextmanager

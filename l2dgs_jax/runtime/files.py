@@ -1,6 +1,7 @@
 """Files and folders that are written whole or not at all."""
 
 import contextlib
+import errno
 import json
 import os
 import tempfile
@@ -8,7 +9,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from l2dgs_jax.errors import UserError
+from l2dgs_jax.errors import DISK_FULL, UserError
+
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # the disk, the user's share of it, or the limit of a file
 
 
 @contextlib.contextmanager
@@ -27,9 +30,38 @@ def replacing(path: Path) -> Iterator[Path]:
         yield temporary
         os.replace(temporary, path)
     except OSError as error:
-        raise UserError(f"{path}: cannot be written ({error.strerror}); expected a writable folder") from None
+        raise unwritable(path, error) from None
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def append_line(path: Path, line: str) -> None:
+    """Add a line to a file. Whoever reads it must bear with a last line that is torn.
+
+    Raises:
+        UserError: the file cannot be written.
+    """
+    try:
+        with open(path, "a") as file:
+            file.write(f"{line}\n")
+    except OSError as error:
+        raise unwritable(path, error) from None
+
+
+def flush(path: Path) -> None:
+    """Have a file, or what a folder lists, on the disk itself, where a power cut leaves it whole."""
+    descriptor = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def unwritable(path: Path, error: OSError) -> UserError:
+    """What to raise where the system refuses to write."""
+    if error.errno in FULL:
+        return UserError(f"{path}: cannot be written ({error.strerror}); expected more room", DISK_FULL)
+    return UserError(f"{path}: cannot be written ({error.strerror}); expected a writable folder")
 
 
 def make_folder(path: Path) -> None:
@@ -77,6 +109,7 @@ def write_json(path: Path, content: Any) -> None:
     make_folder(path.parent)
     with replacing(path) as temporary:
         temporary.write_text(json.dumps(content, indent=2) + "\n")
+        flush(temporary)
 
 
 def is_taken(path: Path) -> bool:

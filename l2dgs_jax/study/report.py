@@ -71,7 +71,7 @@ def _plot(path: Path, members: Sequence[dict[str, Any]], folder: Path) -> None:
     figure = Figure(figsize=(15, max(4, 0.3 * len(members))), layout="constrained")
     over_time, ends = figure.subplots(1, 2, width_ratios=(3, 2))
     for member in members:
-        lines = [json.loads(line) for line in (folder / member["name"] / runs.METRICS).read_text().splitlines()]
+        lines = runs.read_metrics(folder / member["name"])
         over_time.plot([line["step"] for line in lines], [line["psnr"] for line in lines], label=member["name"])
     over_time.set(xlabel="step", ylabel="low-light PSNR of the step's views, dB")
     over_time.legend(fontsize=6)

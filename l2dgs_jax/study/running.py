@@ -12,14 +12,14 @@ from l2dgs_jax import runs
 from l2dgs_jax.config import to_dict
 from l2dgs_jax.data.images import write_image
 from l2dgs_jax.errors import UserError
-from l2dgs_jax.runs import Recorder, Run, checkpoints
+from l2dgs_jax.runs import Recorder, Run
 from l2dgs_jax.runs.scores import evaluate
 from l2dgs_jax.runtime import devices, distributed
 from l2dgs_jax.runtime.files import is_taken, make_folder, write_json
 from l2dgs_jax.study import report
 from l2dgs_jax.study.grouping import Trial, load_groups
 from l2dgs_jax.study.spec import Plan, Spec
-from l2dgs_jax.training import DivergedError, Member, Progress, engine, initial_state
+from l2dgs_jax.training import DivergedError, Member, Progress, engine
 from l2dgs_jax.visualize import contact_sheet
 
 PLANS = "study.json"  # the members that OUT holds
@@ -95,11 +95,8 @@ def _train(group: Sequence[Trial], output: Path, mesh: Mesh | None) -> None:
         folder, config = output / trial.plan.name, trial.config
         if (folder / DIVERGED).exists():
             continue
-        if (folder / runs.CHECKPOINT).exists():
-            state, needed = checkpoints.load(folder / runs.CHECKPOINT, config, len(trial.dataset.train.names))
-            pair_capacity = max(needed or 0, pair_capacity or 0) or None
-        else:
-            state = initial_state(trial.dataset, config)
+        state, needed, _ = runs.last_checkpoint(folder, trial.dataset, config)
+        pair_capacity = max(needed or 0, pair_capacity or 0) or None
         if int(state.step) < config.steps:
             members[trial.plan.name] = Member(trial.dataset.train, config, state)
     distributed.barrier("all checkpoints are read")
@@ -153,7 +150,7 @@ class _Follower:
 
     def _freeze(self, progress: Progress) -> None:
         """Keep the last state that could be trusted, and say what was found after it."""
-        self.record.save(progress, self.index, runs.CHECKPOINT)
+        self.record.checkpoint(progress, self.index)
         terms = devices.member(progress.report.terms, self.index)
         found = {"step": progress.step - 1, "terms": {name: str(float(value)) for name, value in terms.items()}}
         write_json(self.folder / DIVERGED, found)
@@ -166,7 +163,7 @@ def _score(trial: Trial, output: Path) -> None:
     path = folder / report.RESULT
     if path.exists():
         return
-    state = checkpoints.load(folder / runs.CHECKPOINT, config, len(trial.dataset.train.names)).state
+    state = runs.last_checkpoint(folder, trial.dataset, config).state
     run = Run(config, trial.dataset, state, folder)
     write_image(folder / runs.CONTACT_SHEET, contact_sheet(run))
     diverged = (folder / DIVERGED).exists()

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import pytest
 from scenes import edit_json, write_nerfies
+from tiny_training import assert_equal_states, tiny
 
 from l2dgs_jax import runs, train
 from l2dgs_jax.config import PRESETS
@@ -21,6 +22,8 @@ from l2dgs_jax.runs import checkpoints, open_run
 from l2dgs_jax.runtime import command_line, devices
 from l2dgs_jax.training import engine
 from l2dgs_jax.visualize.video import video_path
+from l2dgs_jax.runtime.locks import locked
+from l2dgs_jax.training import engine, resolve
 
 TINY = [
     "--coarse-steps=5",
@@ -101,6 +104,63 @@ def test_a_killed_run_resumes_to_the_same_result(scene, environment, finished, t
     assert steps == sorted(set(steps))
 
 
+@pytest.mark.slow
+def test_stopped_and_killed_at_random_it_comes_to_the_same_result(scene, environment, finished, tmp_path):
+    folder, rng, ends = tmp_path / "run", np.random.default_rng(0), []
+    for stop in (signal.SIGTERM, signal.SIGKILL, signal.SIGINT, None):
+        resume = ["--resume"] if folder.exists() else TINY
+        arguments = command(scene, "--output", folder, "--json", *resume)
+        with subprocess.Popen(
+            arguments, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        ) as process:
+            if stop:
+                assert any("compiling" in line for line in process.stdout)
+                time.sleep(rng.uniform(0, 2))
+                process.send_signal(stop)
+            output, errors = process.communicate()
+        ends.append(process.returncode)
+        if process.returncode > 0:
+            assert process.returncode == 128 + stop, errors
+            assert f"--output {folder} --resume" in errors.splitlines()[-1]
+            assert json.loads(output.splitlines()[-1])["code"] == process.returncode
+        assert "Traceback" not in errors
+    assert ends[0] == 128 + signal.SIGTERM
+    assert ends[-1] == 0
+    state, expected = read_state(folder, scene), read_state(finished[0], scene)
+    assert_equal_states(state, expected)
+
+
+def test_a_second_training_in_a_folder_is_refused(refuses, scene, finished):
+    with locked(finished[0]):
+        refuses(scene, "--output", finished[0], "--resume", naming=[str(finished[0]), "another process"])
+
+
+def test_a_run_without_a_checkpoint_starts_from_the_beginning(scene, tmp_path, monkeypatch):
+    class ReachedError(Exception):
+        pass
+
+    def first_step(states, batches, values, step, **_):
+        assert states.step == step == 0
+        raise ReachedError
+
+    monkeypatch.setattr(engine, "train_steps", first_step)
+    runs.write_settings(tmp_path / "run", str(scene), resolve(tiny(), load_dataset(scene)))
+    with pytest.raises(ReachedError):
+        train.main([str(scene), "--output", str(tmp_path / "run"), "--resume"])
+
+
+def test_an_interruption_before_the_first_step_is_one_word(scene, tmp_path, monkeypatch, capsys):
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(train, "load_dataset", interrupt)
+    with pytest.raises(SystemExit) as caught:
+        command_line.run(train.main, [str(scene), "--output", str(tmp_path / "run"), *TINY])
+    assert caught.value.code == 128 + signal.SIGINT
+    assert capsys.readouterr().err == "stopped\n"
+    assert not (tmp_path / "run").exists()
+
+
 @pytest.fixture
 def refuses(monkeypatch, capsys):
     """Asserts that a command line ends in one sentence and exit code 2, before anything is compiled."""
@@ -157,7 +217,7 @@ def test_unknown_preset(refuses, scene, tmp_path):
 
 
 def test_no_steps(refuses, scene, tmp_path):
-    for option in ("--batch-size=0", "--batch-size=-1", "--checkpoint-every=0"):
+    for option in ("--batch-size=0", "--batch-size=-1", "--checkpoint-every=0", "--keep-checkpoints=0"):
         refuses(scene, option, "--output", tmp_path / "run", naming=[option.split("=")[0], "at least 1"])
         assert not (tmp_path / "run").exists()
     refuses(scene, "--coarse-steps=0", "--fine-steps=0", "--output", tmp_path / "run", naming=["--coarse-steps"])

@@ -1,17 +1,25 @@
 """Checkpoints: whole or refused, by one sentence."""
 
 import dataclasses
+import json
+import os
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from tiny_training import FRAMES, assert_equal_states, make_dataset, tiny
 
 from l2dgs_jax.config import EXECUTION, to_dict
-from l2dgs_jax.errors import UserError
+from l2dgs_jax.errors import DISK_FULL, UserError
 from l2dgs_jax.runs import checkpoints
 from l2dgs_jax.runs.checkpoints import Checkpoint
 from l2dgs_jax.training import initial_state
+
+try:
+    import resource
+except ImportError:  # Windows
+    resource = None
 
 
 @pytest.fixture(scope="module")
@@ -49,9 +57,9 @@ def test_a_checkpoint_is_an_npz_and_one_that_numpy_wrote_is_read(dataset, tmp_pa
     assert list(arrays) == ["header", *(jax.tree_util.keystr(key) for key, _ in leaves)]
     np.savez(tmp_path / "numpy.npz", **arrays)
     for name in ("checkpoint.npz", "numpy.npz"):
-        loaded, pair_capacity = checkpoints.load(tmp_path / name, config, FRAMES)
-        assert pair_capacity == 64
-        assert_equal_states(loaded, state)
+        loaded = checkpoints.load(tmp_path / name, config, FRAMES)
+        assert loaded.pair_capacity == 64
+        assert_equal_states(loaded.state, state)
 
 
 @pytest.mark.parametrize("change", [None, lambda x: x[..., None], lambda x: x[:, :-1], lambda x: x > 0])
@@ -79,5 +87,117 @@ def test_how_a_run_is_carried_out_may_change_when_it_goes_on(dataset, tmp_path):
     state = initial_state(dataset, config)
     checkpoints.save(path, Checkpoint(state, 64), config)
     assert set(to_dict(config)) > EXECUTION
-    other = dataclasses.replace(config, checkpoint_every=7, frame_memory=0.0)
+    other = dataclasses.replace(config, checkpoint_every=7, frame_memory=0.0, keep_checkpoints=1)
     assert_equal_states(checkpoints.load(path, other, FRAMES).state, state)
+
+
+def edited(path, **header):
+    """Write a checkpoint's file anew with some entries of its header changed, or without those that are None."""
+    with np.load(path) as file:
+        arrays = dict(file)
+    facts = json.loads(str(arrays["header"])) | header
+    arrays["header"] = np.array(json.dumps({name: fact for name, fact in facts.items() if fact is not None}))
+    np.savez(path, **arrays)
+
+
+def test_older_versions_are_read_and_later_ones_refused(dataset, tmp_path):
+    config, path = tiny(), tmp_path / "checkpoint.npz"
+    state = initial_state(dataset, config)
+    checkpoints.save(path, Checkpoint(state, 64, halvings=2), config)
+    assert checkpoints.load(path, config, FRAMES)[1:] == (64, 2)
+    edited(path, version=None, halvings=None)  # as 0.1.0 wrote it
+    old = checkpoints.load(path, config, FRAMES)
+    assert old[1:] == (64, 0)
+    assert_equal_states(old.state, state)
+    edited(path, version=checkpoints.VERSION + 1, config={"nonsuch": 1})
+    with pytest.raises(UserError, match=r"npz: of version 3; expected at most 2") as caught:
+        checkpoints.load(path, config, FRAMES)
+    assert not isinstance(caught.value, checkpoints.DamagedError)
+
+
+class Bomb:
+    """Goes off when it is unpickled."""
+
+    def __reduce__(self):
+        return os.mkdir, ("exploded",)
+
+
+@pytest.mark.parametrize("place", ["header", ".step"])
+def test_nothing_in_a_checkpoint_is_executed(dataset, tmp_path, monkeypatch, place):
+    monkeypatch.chdir(tmp_path)
+    config, path = tiny(), tmp_path / "checkpoint.npz"
+    checkpoints.save(path, Checkpoint(initial_state(dataset, config)), config)
+    with np.load(path) as file:
+        arrays = dict(file)
+    bomb = np.empty((), object)
+    bomb[()] = Bomb()
+    np.savez(path, **arrays | {place: bomb})
+    with pytest.raises(UserError, match=r"checkpoint\.npz: .*expected"):
+        checkpoints.load(path, config, FRAMES)
+    assert not (tmp_path / "exploded").exists()
+
+
+def numbered(dataset, step):
+    return Checkpoint(initial_state(dataset, tiny())._replace(step=jnp.int32(step)))
+
+
+def steps_kept(path):
+    return [int(checkpoints.load(file, tiny(), FRAMES).state.step) for file in checkpoints.kept(path)]
+
+
+def test_the_last_few_are_kept(dataset, tmp_path):
+    path = tmp_path / "checkpoint.npz"
+    (tmp_path / "coarse.npz").touch()
+    assert checkpoints.kept(path) == []
+    for step, keep, expected in ((1, 3, [1]), (2, 3, [2, 1]), (3, 3, [3, 2, 1]), (4, 3, [4, 3, 2]), (5, 1, [5])):
+        checkpoints.save(path, numbered(dataset, step), tiny(), keep)
+        assert steps_kept(path) == expected
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["checkpoint.npz", "coarse.npz"]
+
+
+def test_a_truncated_one_is_passed_over_and_pushes_out_none(dataset, tmp_path):
+    path = tmp_path / "checkpoint.npz"
+    for step in (1, 2):
+        checkpoints.save(path, numbered(dataset, step), tiny(), 2)
+    path.write_bytes(path.read_bytes()[:-30])
+    with pytest.warns(UserWarning, match=r"npz: truncated .*; checkpoint-1\.npz, of step 1, is used instead"):
+        assert checkpoints.load_last(path, tiny(), FRAMES).state.step == 1
+    checkpoints.save(path, numbered(dataset, 3), tiny(), 2)
+    assert steps_kept(path) == [3, 1]
+    assert checkpoints.load_last(path, tiny(), FRAMES, skip=1).state.step == 1
+    assert checkpoints.load_last(path, tiny(), FRAMES, skip=9).state.step == 1
+    for file in checkpoints.kept(path):
+        file.write_bytes(file.read_bytes()[:100])
+    with pytest.raises(checkpoints.DamagedError, match=r"checkpoint\.npz: truncated"):
+        checkpoints.load_last(path, tiny(), FRAMES)
+
+
+def test_a_byte_that_has_changed_is_found_or_does_not_matter(dataset, tmp_path):
+    path = tmp_path / "checkpoint.npz"
+    state = initial_state(dataset, tiny())
+    checkpoints.save(path, Checkpoint(state, 64), tiny())
+    whole, rng, refused = path.read_bytes(), np.random.default_rng(0), 0
+    for place in rng.integers(0, len(whole), 25):
+        path.write_bytes(whole[:place] + bytes([whole[place] ^ 255]) + whole[place + 1 :])
+        try:
+            assert_equal_states(checkpoints.load(path, tiny(), FRAMES).state, state)
+        except UserError:
+            refused += 1
+    assert refused > 12
+
+
+@pytest.mark.skipif(resource is None, reason="the system has no limits")
+def test_a_full_disk_leaves_the_one_before(dataset, tmp_path):
+    path = tmp_path / "checkpoint.npz"
+    checkpoints.save(path, numbered(dataset, 1), tiny(), 2)
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    for room in (0, path.stat().st_size // 2, path.stat().st_size - 1):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (room, before[1]))
+        try:
+            with pytest.raises(UserError, match=r"npz: cannot be written \(File too large\); expected") as caught:
+                checkpoints.save(path, numbered(dataset, 2), tiny(), 2)
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        assert caught.value.code == DISK_FULL
+        assert steps_kept(path) == [1]
+        assert [file.name for file in tmp_path.iterdir()] == [path.name]

@@ -104,3 +104,15 @@ def test_a_run_of_no_scene_cannot_be_saved(dataset, tmp_path, quick):
     run = fit(dataset, tiny(coarse_steps=1, fine_steps=0, density=PRESETS["default"].density))
     with pytest.raises(UserError, match="tiny: was not read from a scene"):
         save_run(run, tmp_path / "run")
+
+
+def test_halved_rates_hold_for_both_stages(dataset, quick):
+    config = resolve(tiny(coarse_steps=2, fine_steps=2, density=PRESETS["default"].density), dataset)
+    rates = []
+    start = Checkpoint(initial_state(dataset, config)._replace(step=jnp.int32(2)), 2048, halvings=2)
+    run = fit(dataset, config, lambda progress: rates.append(progress.states.adam.schedules), start=start)
+    assert run.config == config
+    assert rates
+    for name, schedule in start.state.adam.schedules.items():
+        assert rates[0][name].start == 0.25 * schedule.start
+        assert rates[0][name].end == 0.25 * schedule.end

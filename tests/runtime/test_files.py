@@ -3,7 +3,7 @@
 import pytest
 
 from l2dgs_jax.errors import UserError
-from l2dgs_jax.runtime.files import new_folder, replacing
+from l2dgs_jax.runtime.files import append_line, new_folder, replacing
 
 
 def test_a_file_is_replaced_whole_or_not_at_all(tmp_path):
@@ -35,7 +35,7 @@ def test_a_file_that_cannot_take_its_place_is_a_clear_error_and_leaves_nothing_b
             temporary.write_text("half")
             raise OSError(28, "No space left on device")
 
-    with pytest.raises(UserError, match=r"file\.txt: cannot be written \(No space left on device\)"):
+    with pytest.raises(UserError, match=r"file\.txt: cannot be written \(No space left on device\); .* room"):
         fill_the_disk()
     assert not list(tmp_path.iterdir())
 
@@ -70,3 +70,11 @@ def test_a_folder_does_not_take_the_place_of_anything(tmp_path):
             new_folder(tmp_path / name),
         ):
             raise AssertionError("entered")
+
+
+def test_a_line_that_cannot_be_added_is_one_sentence(tmp_path):
+    append_line(tmp_path / "lines", "a")
+    append_line(tmp_path / "lines", "b")
+    assert (tmp_path / "lines").read_text() == "a\nb\n"
+    with pytest.raises(UserError, match=r"nonsuch/lines: cannot be written \(No such file or directory\); expected"):
+        append_line(tmp_path / "nonsuch" / "lines", "a")

@@ -158,7 +158,7 @@ def test_a_resumed_run_equals_the_uninterrupted_one(dataset, finished, tmp_path)
                 saved = Checkpoint(state_of(progress), progress.pair_capacity)
                 checkpoints.save(tmp_path / "c.npz", saved, config)
                 break
-        state, pair_capacity = checkpoints.load(tmp_path / "c.npz", config, FRAMES)
+        state, pair_capacity, _ = checkpoints.load(tmp_path / "c.npz", config, FRAMES)
         assert int(state.step) == stop
         assert_equal_states(finish(dataset, config, state, pair_capacity).states, finished.states)
 

@@ -1,0 +1,93 @@
+"""A training that leaves its steps in a run folder, and comes through what interrupts it."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import jax
+
+from l2dgs_jax.config import Config
+from l2dgs_jax.data import Dataset
+from l2dgs_jax.errors import DIVERGED, Interrupted, UserError
+from l2dgs_jax.runs.checkpoints import Checkpoint
+from l2dgs_jax.runs.displays import Display
+from l2dgs_jax.runs.divergence import HALVINGS, halve_rates, rate_factor, standing
+from l2dgs_jax.runs.fitting import fit
+from l2dgs_jax.runs.recorder import Recorder
+from l2dgs_jax.runs.run import Run
+from l2dgs_jax.runtime.memory import memory_errors
+from l2dgs_jax.training import DivergedError, Progress
+
+LESS_MEMORY = (
+    "enough: a larger --downscale, or a smaller --batch-size, --density.max-gaussians or --frame-memory, needs less"
+)
+
+
+def fit_in_folder(
+    folder: Path,
+    dataset: Dataset,
+    config: Config,
+    start: Checkpoint,
+    display: Display,
+    stopping: Callable[[], int | None],
+    device_count: int | None = None,
+) -> Run:
+    """`fit` with everything recorded that it takes to go on; a training that diverges goes back and on at lower rates.
+
+    Args:
+        folder: of the run, with its settings.
+        dataset: its scene.
+        config: its settings, what they left to the data filled in.
+        start: where it goes on from.
+        display: told how it goes.
+        stopping: asked after every step for a signal that wants it to stop.
+        device_count: see `fit`.
+
+    Raises:
+        Interrupted: a signal wanted it to stop; its last step is in a checkpoint.
+        UserError: the disk is full or the folder not writable, the memory does not suffice, or lower rates do not help.
+    """
+    while True:
+        try:
+            return _fit(folder, dataset, config, start, display, stopping, device_count)
+        except DivergedError as error:
+            if start.halvings == HALVINGS or jax.process_count() > 1:
+                raise UserError(
+                    f"{folder}: {error}; expected finite values: train anew with lower learning rates", DIVERGED
+                ) from None
+            reason = str(error)
+        halve_rates(folder, start.halvings + 1)
+        start = standing(folder, dataset, config)
+        back, factor = int(start.state.step), rate_factor(start.halvings)
+        message = f"{reason}: going back to step {back}, with learning rates times {factor:g}"
+        display("diverged", message=message, step=back, rate_factor=factor)
+
+
+def _fit(
+    folder: Path,
+    dataset: Dataset,
+    config: Config,
+    start: Checkpoint,
+    display: Display,
+    stopping: Callable[[], int | None],
+    device_count: int | None,
+) -> Run:
+    done = int(start.state.step)
+    record = Recorder(folder, config, done, start.halvings)
+
+    def on_step(progress: Progress) -> None:
+        line = record(progress)
+        display("step", step=record.step, stage=config.stage_of(record.step))
+        if line:
+            display("metrics", **line)
+        if record.step == config.coarse_steps < config.steps:
+            display("compiling", stage="fine")
+        signal_number = stopping()
+        if signal_number:
+            record.checkpoint(progress)
+            raise Interrupted(f"stopped after step {record.step} of {config.steps}", 128 + signal_number)
+
+    display("begin", step=done, steps=config.steps)
+    if done < config.steps:
+        display("compiling", stage=config.stage_of(done + 1))
+    with memory_errors(lambda: f"after step {record.step} of {config.steps}", LESS_MEMORY):
+        return fit(dataset, config, on_step, start=start, device_count=device_count)

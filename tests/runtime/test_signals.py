@@ -1,0 +1,51 @@
+"""Signals as requests to stop."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+
+import pytest
+
+from l2dgs_jax.runtime.signals import STOPPING, stop_requests
+
+
+@pytest.mark.parametrize("number", STOPPING)
+def test_a_signal_is_a_request_and_its_handler_comes_back(number):
+    noticed, before = threading.Event(), signal.getsignal(number)
+    with stop_requests(noticed.set) as stopping:
+        assert stopping() is None
+        os.kill(os.getpid(), number)
+        assert noticed.wait(10)
+        assert stopping() == number
+        os.kill(os.getpid(), signal.SIGTERM)  # not the second Ctrl-C of a person in a hurry
+    assert signal.getsignal(number) == before
+    assert signal.set_wakeup_fd(-1) == -1
+
+
+def test_an_ignored_signal_stays_ignored():
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with stop_requests(lambda: None) as stopping:
+            os.kill(os.getpid(), signal.SIGINT)
+            assert stopping() is None
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def test_a_second_interrupt_ends_the_process_at_once():
+    """Even if Python does not come to run a handler, as in a long compilation."""
+    program = (
+        "from l2dgs_jax.runtime.signals import stop_requests\n"
+        "import hashlib\n"
+        "with stop_requests(lambda: print('stopping', flush=True)):\n"
+        "    print('ready', flush=True)\n"
+        "    hashlib.pbkdf2_hmac('sha256', b'', b'', 10**9)\n"
+    )
+    with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout.readline() == "ready\n"
+        process.send_signal(signal.SIGINT)
+        assert process.stdout.readline() == "stopping\n"
+        process.send_signal(signal.SIGINT)
+        assert process.wait(10) == 128 + signal.SIGINT
