@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
+from l2dgs_jax.cameras.geometry import OPENGL_AXES
 from l2dgs_jax.data import clouds, splits
 from l2dgs_jax.data.assembly import Frame, assemble
 from l2dgs_jax.data.dataset import Dataset
@@ -29,7 +30,6 @@ from l2dgs_jax.runtime.files import new_folder, write_json
 
 Entry = tuple[Path, dict[str, Any], Path]  # the file that lists a frame, what it says of it, and the frame's picture
 
-_AXES = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL's camera axes from OpenCV's, and back
 _PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
 _FISHEYE = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 
@@ -83,7 +83,7 @@ def write(dataset: Dataset, folder: Path) -> None:
             raise UserError("--to transforms: some pixels of the scene are not valid; expected nerfies, colmap or llff")
         for name, viewmat, K, time in zip(split.names, *split.cameras, strict=True):
             files[part].append(f"images/{name}.png")
-            world = np.linalg.inv(np.asarray(viewmat, np.float64)) @ _AXES
+            world = np.linalg.inv(np.asarray(viewmat, np.float64)) @ OPENGL_AXES
             intrinsics = dict(zip(("fl_x", "fl_y", "cx", "cy"), map(float, (K[0, 0], K[1, 1], *K[:2, 2])), strict=True))
             entry = {"file_path": files[part][-1], "time": float(time), "transform_matrix": world.tolist()}
             frames.append(entry | intrinsics)
@@ -199,7 +199,7 @@ def _frame(name: str, path: Path, content: dict[str, Any], file: Path, time: flo
     if min(size) < 1:
         raise UserError(f"{source}: 'w' and 'h' are {size}; expected positive numbers of pixels")
     K, lens = _intrinsics(path, source, content, size)
-    return Frame(name, source, np.linalg.inv(matrix @ _AXES), K, lens, size, time, picture, alpha="coverage")
+    return Frame(name, source, np.linalg.inv(matrix @ OPENGL_AXES), K, lens, size, time, picture, alpha="coverage")
 
 
 def _intrinsics(
