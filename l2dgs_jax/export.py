@@ -87,9 +87,8 @@ def _check(options: Export) -> None:
     instants = {name: value for name, value in (("time", options.time), ("times", options.times)) if value is not None}
     for name, value in instants.items():
         if options.to in TIMELESS:
-            raise UserError(
-                f"--{name} {value}: --to {options.to} covers all instants; expected {name} with other formats"
-            )
+            others = ", ".join(format for format in FILES if format not in TIMELESS)
+            raise UserError(f"--{name} {value}: {options.to} covers all instants; expected it with one of {others}")
     if len(instants) == 2:
         raise UserError(f"--times {options.times}: given beside --time {options.time}; expected one of the two")
     if options.time is not None and not 0 <= options.time <= 1:
@@ -130,7 +129,7 @@ def _write_splats(run: Run, options: Export, path: Path) -> None:
         print(f"PSNR of their images against the exact well-lit ones: {_range(scores, '.2f')} dB")
 
 
-def _range(values: Sequence[float], form: str) -> str:
+def _range(values: Sequence[int] | Sequence[float], form: str) -> str:
     low, high = format(min(values), form), format(max(values), form)
     return low if low == high else f"{low} to {high}"
 

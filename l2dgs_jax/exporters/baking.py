@@ -90,7 +90,7 @@ def _fit(
     geometry: Geometry,
     cameras: Camera,
     images: Float[Array, "V H W 3"],
-    rounds: int,
+    rounds: Int[Array, ""] | int,
     *,
     canvas: _Canvas,
     pair_capacity: int,
@@ -136,7 +136,9 @@ def _blend(
 
 
 @partial(jax.jit, static_argnames=("cfg", "moving"))
-def _moved(scene: Scene, cameras: Camera, sh_degree: int, *, cfg: ModelConfig, moving: bool) -> MovedGaussians:
+def _moved(
+    scene: Scene, cameras: Camera, sh_degree: Int[Array, ""] | int, *, cfg: ModelConfig, moving: bool
+) -> MovedGaussians:
     return deform(scene, cameras, cfg, moving=moving, sh_degree_active=sh_degree)
 
 
