@@ -13,7 +13,7 @@ from tqdm import tqdm
 from l2dgs_jax.cameras.geometry import mean_up
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.exporters import antimatter15, gltf, ply
-from l2dgs_jax.exporters.baking import bake
+from l2dgs_jax.exporters.baking import OVERBRIGHT, bake
 from l2dgs_jax.exporters.camera_path import camera_path
 from l2dgs_jax.exporters.model_arrays import model_arrays
 from l2dgs_jax.exporters.splats import Splats, visible
@@ -31,6 +31,7 @@ FILES = {  # what is written if --output says nothing else
     "cameras": "camera_path.json",
 }
 TIMELESS = ("npz", "cameras")
+IN_BYTES = ("splat", "cloud")  # which is how they hold colours: nothing is brighter than white
 
 
 @dataclass(frozen=True)
@@ -87,7 +88,7 @@ def _check(options: Export) -> None:
     instants = {name: value for name, value in (("time", options.time), ("times", options.times)) if value is not None}
     for name, value in instants.items():
         if options.to in TIMELESS:
-            others = ", ".join(format for format in FILES if format not in TIMELESS)
+            others = ", ".join(to for to in FILES if to not in TIMELESS)
             raise UserError(f"--{name} {value}: {options.to} covers all instants; expected it with one of {others}")
     if len(instants) == 2:
         raise UserError(f"--times {options.times}: given beside --time {options.time}; expected one of the two")
@@ -112,9 +113,11 @@ def _write_splats(run: Run, options: Export, path: Path) -> None:
     sequence = options.times is not None
     middle = 0.5 if options.time is None else options.time
     times = np.linspace(0, 1, options.times).tolist() if options.times else [middle]
+    brightest = 1.0 if options.to in IN_BYTES else OVERBRIGHT
     counts, scores = [], []
     with new_folder(path) if sequence else replacing(path) as target:
-        baked = tqdm(bake(run, times), total=len(times), desc="export", unit="instant", dynamic_ncols=True)
+        baked = bake(run, times, brightest)
+        baked = tqdm(baked, total=len(times), desc="export", unit="instant", dynamic_ncols=True)
         for number, (splats, score) in enumerate(baked, 1):
             shown = visible(splats)
             if not len(shown.means):
@@ -124,9 +127,10 @@ def _write_splats(run: Run, options: Export, path: Path) -> None:
             counts.append(len(shown.means))
             scores.append(score)
     files = f"{len(times)} files of " if sequence else ""
-    print(f"wrote {files}{_range(counts, 'd')} of {len(splats.means)} Gaussians to {path}; the others are invisible")
+    total = len(splats.means)
+    print(f"wrote {files}{_range(counts, 'd')} visible Gaussians, of {total} in all, to {path}")
     if options.to != "cloud":
-        print(f"PSNR of their images against the exact well-lit ones: {_range(scores, '.2f')} dB")
+        print(f"PSNR of their images against the exact well-lit images: {_range(scores, '.2f')} dB")
 
 
 def _range(values: Sequence[int] | Sequence[float], form: str) -> str:

@@ -27,7 +27,7 @@ FOLDERS = (
 )
 COMMANDS = ("train", "evaluate", "render", "export", "sweep", "prepare", "convert", "masks", "simulate")
 LAYERS = (*VOCABULARY, *FOLDERS, "commands")
-TOUCH_FILES = ("runtime", "data", "runs", "visualize", "exporters", "preprocess", "study", "commands")
+TOUCH_FILES = ("runtime", "data", "runs", "visualize", "preprocess", "study", "commands")
 MODULES = [path for path in PACKAGE.rglob("*.py") if path not in (PACKAGE / "__init__.py", PACKAGE / "__main__.py")]
 each_module = pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(PACKAGE)))
 

@@ -1,8 +1,8 @@
 """The well-lit scene at an instant as Gaussians that each have one colour, which is what splat viewers draw.
 
 The well-lit image is a product of two blended images (Eq. 7), and reflectances may lie outside [0, 1]; a viewer blends
-once, and colours that most of them keep in bytes. So the colours are those in [0, 1] whose blend comes closest to the
-exact images of some training cameras, in the sense of least squares: a convex problem, as a blend is linear in them.
+once, and takes no colours below 0. So the colours are those in a range whose blend comes closest to the exact images of
+some training cameras, in the sense of least squares: a convex problem, as a blend is linear in its colours.
 """
 
 from collections.abc import Iterable, Iterator
@@ -29,6 +29,7 @@ from l2dgs_jax.types import Camera, MovedGaussians, RasterOutput, Scene
 
 VIEWS = 8  # training cameras that colours are fitted to; they are checked on those halfway between
 FIRST_ROUNDS, ROUNDS = 24, 6  # of the fit, at the first instant and at others, which start from the one before
+OVERBRIGHT = 1.25  # a brightest colour with which most of what [0, 1] costs is won back; more gains hardly anything
 LEAST_WEIGHT = 1e-9  # summed over all pixels; what is seen less keeps its colour
 
 Geometry = tuple[Float[Array, "N 3"], Float[Array, "N 4"], Float[Array, "N 3"], Float[Array, " N"]]
@@ -55,7 +56,7 @@ class _Canvas(NamedTuple):
     background: float
 
 
-def bake(run: Run, times: Iterable[float]) -> Iterator[Baked]:
+def bake(run: Run, times: Iterable[float], brightest: float = 1.0) -> Iterator[Baked]:
     """The well-lit scene at each of some instants, one after the other.
 
     The colours are to be blended over black; over white if `model.background` is 1.
@@ -63,24 +64,27 @@ def bake(run: Run, times: Iterable[float]) -> Iterator[Baked]:
     Args:
         run: the run.
         times: instants in [0, 1], best in their order: each starts from the colours of the one before.
+        brightest: upper end of the colours' range: 1, or somewhat more (`OVERBRIGHT`) where nothing clips them before
+            they are blended.
     """
     scene, cfg, renderer, train = run.state.scene, run.config.model, run.renderer(), run.dataset.train
     near_plane = float(NEAR_PLANE * length_unit(scene.extent, cfg))
     canvas = _Canvas(run.dataset.width, run.dataset.height, near_plane, cfg.background**2)
     views = np.unique(np.linspace(0, len(train.names) - 1, 2 * VIEWS - 1).round().astype(int))
-    halves = views[::2], views[1::2] if len(views) > 1 else views
+    between = views[1::2] if len(views) > 1 else views
     colors, rounds = None, FIRST_ROUNDS
     for time in times:
-        fitted, checked = (_at_instant(train.cameras, half, time) for half in halves)
+        fitted, checked = (_at_instant(train.cameras, chosen, time) for chosen in (views[::2], between))
         moved = _moved(scene, fitted, renderer.sh_degree, cfg=cfg, moving=run.moving)
         geometry = tuple(rows[0] for rows in (moved.means, moved.quats, moved.scales, moved.opacities))
         if colors is None:
-            colors = jnp.clip(moved.illumination.mean(0)[:, None] * moved.reflectance[0], 0, 1)
-        pairs = _blend(colors, geometry, fitted, canvas)[1].pairs
-        images = _exact(renderer, fitted)
-        colors = _fit(colors, geometry, fitted, images, rounds, canvas=canvas, pair_capacity=next_capacity(int(pairs)))
+            colors = jnp.clip(moved.illumination.mean(0)[:, None] * moved.reflectance[0], 0, brightest)
+        _, drawn = _blend(colors, geometry, fitted, canvas)
+        room, images = next_capacity(int(drawn.pairs)), _exact(renderer, fitted)
+        colors = _fit(colors, geometry, fitted, images, rounds, brightest, canvas=canvas, pair_capacity=room)
         rounds = ROUNDS
-        closeness = psnr(_blend(colors, geometry, checked, canvas)[0], _exact(renderer, checked)).mean()
+        images, _ = _blend(colors, geometry, checked, canvas)
+        closeness = psnr(images, _exact(renderer, checked)).mean()
         yield Baked(_splats(geometry, colors, np.asarray(scene.alive)), float(closeness))
 
 
@@ -91,11 +95,12 @@ def _fit(
     cameras: Camera,
     images: Float[Array, "V H W 3"],
     rounds: Int[Array, ""] | int,
+    brightest: Float[Array, ""] | float,
     *,
     canvas: _Canvas,
     pair_capacity: int,
 ) -> Float[Array, "N 3"]:
-    """The colours in [0, 1] whose images have the least squared error, by projected gradients (FISTA).
+    """The colours from 0 to `brightest` whose images have the least squared error, by projected gradients (FISTA).
 
     The weights of a pixel's Gaussians sum to its alpha. With A of these weights, that makes the row sums of A^T A equal
     to A^T alpha, and a step of a Gaussian's own gradient over its row sum never too long.
@@ -107,7 +112,7 @@ def _fit(
     def step(count: Int[Array, ""], state: tuple[Array, Array]) -> tuple[Array, Array]:
         last, ahead = state
         (gradient,) = pull(blend(ahead)[0] - images)
-        new = jnp.clip(ahead - gradient / jnp.maximum(row_sums, LEAST_WEIGHT), 0, 1)
+        new = jnp.clip(ahead - gradient / jnp.maximum(row_sums, LEAST_WEIGHT), 0, brightest)
         momentum = count.astype(new.dtype) / (count + 3).astype(new.dtype)
         return new, new + momentum * (new - last)
 

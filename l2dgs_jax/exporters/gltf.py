@@ -28,7 +28,7 @@ def encode(splats: Splats, up: Float[np.ndarray, "3"]) -> bytes:
     """
     attributes = {
         "POSITION": splats.means,
-        "COLOR_0": np.column_stack([srgb_to_linear(splats.colors), splats.opacities]),
+        "COLOR_0": np.column_stack([srgb_to_linear(splats.colors.clip(0, 1)), splats.opacities]),
         f"{EXTENSION}:ROTATION": np.roll(splats.quats, -1, axis=-1),
         f"{EXTENSION}:SCALE": splats.scales,
         f"{EXTENSION}:OPACITY": splats.opacities[:, None],

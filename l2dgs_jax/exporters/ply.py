@@ -29,4 +29,4 @@ def encode(splats: Splats) -> bytes:
 
 def encode_cloud(splats: Splats) -> bytes:
     """The centres of the Gaussians as points with 8-bit colours."""
-    return encode_ply(colored_points(splats.means, splats.colors))
+    return encode_ply(colored_points(splats.means, splats.colors.clip(0, 1)))

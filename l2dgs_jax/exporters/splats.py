@@ -18,7 +18,7 @@ class Splats(NamedTuple):
         quats: rotations, wxyz, of norm 1.
         scales: standard deviations in world units.
         opacities: in [0, 1].
-        colors: sRGB in [0, 1], blended as such.
+        colors: sRGB, blended as such; at least 0, and 1 is white.
     """
 
     means: Float32[np.ndarray, "N 3"]

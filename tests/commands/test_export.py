@@ -32,7 +32,8 @@ def baked_times(monkeypatch):
     """In place of baking, which has its own tests: three Gaussians that move by the instant, one of them invisible."""
     times = []
 
-    def bake(run, instants):
+    def bake(run, instants, brightest):
+        assert brightest >= 1
         for time in instants:
             times.append(time)
             means = np.full((3, 3), time, np.float32)
@@ -55,7 +56,7 @@ def test_one_instant_goes_to_one_file(run_folder, baked_times, tmp_path, capsys,
     assert baked_times == [0.25]
     assert [p.name for p in path.parent.iterdir()] == [path.name]
     output = capsys.readouterr().out
-    assert f"wrote 2 of 3 Gaussians to {path}" in output
+    assert f"wrote 2 visible Gaussians, of 3 in all, to {path}" in output
     assert ("30.25 dB" in output) == (format != "cloud")
 
 
@@ -67,7 +68,7 @@ def test_many_instants_go_to_a_folder_that_counts_them(run_folder, baked_times, 
     for file, time in zip(files, baked_times, strict=True):
         points, _ = clouds.read_ply(file)
         assert (points == time).all()
-    assert f"wrote 5 files of 2 of 3 Gaussians to {tmp_path / 'frames'}" in capsys.readouterr().out
+    assert f"wrote 5 files of 2 visible Gaussians, of 3 in all, to {tmp_path / 'frames'}" in capsys.readouterr().out
 
 
 def test_files_go_to_the_runs_folder_unless_told_otherwise(run_folder, baked_times):
@@ -81,8 +82,8 @@ def test_files_go_to_the_runs_folder_unless_told_otherwise(run_folder, baked_tim
 def test_a_sequence_that_fails_leaves_nothing(run_folder, baked_times, tmp_path, monkeypatch, capsys):
     canned = export.bake
 
-    def faint(run, times):
-        for (splats, psnr), time in zip(canned(run, times), times, strict=True):
+    def faint(run, times, brightest):
+        for (splats, psnr), time in zip(canned(run, times, brightest), times, strict=True):
             yield Baked(splats._replace(opacities=splats.opacities * (time < 0.6)), psnr)
 
     monkeypatch.setattr(export, "bake", faint)
@@ -141,5 +142,5 @@ def test_the_whole_way(run_folder, tmp_path):
     command = [sys.executable, "-m", "l2dgs_jax.export", str(run_folder), "--to", "ply", "--times", "2"]
     done = subprocess.run([*command, "--output", str(tmp_path / "ply")], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    assert "PSNR of their images against the exact well-lit ones" in done.stdout
+    assert "PSNR of their images against the exact well-lit images" in done.stdout
     assert sorted(p.name for p in (tmp_path / "ply").iterdir()) == ["frame0001.ply", "frame0002.ply"]

@@ -85,6 +85,12 @@ def test_the_fit_brings_colours_closer_at_every_instant(run, baked, monkeypatch)
     assert all(psnr > unfitted + 3 for _, psnr in baked)
 
 
+def test_brighter_colours_come_closer(run, baked):
+    splats, psnr = next(baking.bake(run, TIMES, brightest=1.25))
+    assert 1 < splats.colors.max() <= 1.25
+    assert psnr > baked[0].psnr
+
+
 def test_closeness_is_that_of_views_not_fitted_to(run, baked):
     for time, (splats, psnr) in zip(TIMES, baked, strict=True):
         errors = np.square(images(splats, run) - exact_images(time, run)).mean((1, 2, 3))

@@ -29,7 +29,7 @@ def splats():
     )
     splats = Splats(*(array.astype(np.float32) for array in arrays))
     splats.opacities[:2] = 0, 1
-    splats.colors[:2] = [[0], [1]]
+    splats.colors[:3] = [[0], [1], [1.2]]
     splats.scales[2, 0] = 0
     return splats
 
@@ -62,7 +62,7 @@ def test_a_splat_file_has_32_bytes_a_gaussian_and_the_most_prominent_first(splat
     order = [places[tuple(mean)] for mean in floats[:, :3].tolist()]
     assert sorted(order) == list(range(50))
     np.testing.assert_array_equal(floats[:, 3:], splats.scales[order])
-    np.testing.assert_allclose(levels[:, :3] / 255, splats.colors[order], atol=0.51 / 255)
+    np.testing.assert_allclose(levels[:, :3] / 255, np.minimum(splats.colors, 1)[order], atol=0.51 / 255)
     np.testing.assert_allclose(levels[:, 3] / 255, splats.opacities[order], atol=0.51 / 255)
     np.testing.assert_allclose((levels[:, 4:] - 128.0) / 128, splats.quats[order], atol=1.01 / 128)
 
@@ -110,7 +110,7 @@ def test_a_gltf_file_follows_the_extension(splats):
     np.testing.assert_allclose(0.5 + SH_C0 * extension["SH_DEGREE_0_COEF_0"], splats.colors, atol=1e-6)
     # Points for programs that do not know the extension: linear light.
     np.testing.assert_allclose(arrays["COLOR_0"][:2], [[0, 0, 0, 0], [1, 1, 1, 1]], atol=1e-6)
-    np.testing.assert_allclose(arrays["COLOR_0"][:, :3], splats.colors**2.2, atol=0.01)
+    np.testing.assert_allclose(arrays["COLOR_0"][:, :3], np.minimum(splats.colors, 1) ** 2.2, atol=0.01)
 
 
 @pytest.mark.parametrize("up", [(0, 1, 0), (0, -1, 0), (0, 0, 1), (0.3, -0.9, 0.2)])
@@ -124,7 +124,7 @@ def test_a_cloud_is_a_ply_file_of_coloured_points(splats, tmp_path):
     (tmp_path / "cloud.ply").write_bytes(ply.encode_cloud(splats))
     points, colors = clouds.read_ply(tmp_path / "cloud.ply")
     np.testing.assert_array_equal(points, splats.means)
-    np.testing.assert_allclose(colors, splats.colors, atol=0.51 / 255)
+    np.testing.assert_allclose(colors, np.minimum(splats.colors, 1), atol=0.51 / 255)
 
 
 def test_what_nothing_would_show_is_left_out(splats):
