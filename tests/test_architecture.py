@@ -21,10 +21,11 @@ FOLDERS = (
     "training",
     "runs",
     "visualize",
+    "exporters",
     "preprocess",
     "study",
 )
-COMMANDS = ("train", "evaluate", "render", "sweep", "prepare", "convert", "masks", "simulate")
+COMMANDS = ("train", "evaluate", "render", "export", "sweep", "prepare", "convert", "masks", "simulate")
 LAYERS = (*VOCABULARY, *FOLDERS, "commands")
 TOUCH_FILES = ("runtime", "data", "runs", "visualize", "preprocess", "study", "commands")
 MODULES = [path for path in PACKAGE.rglob("*.py") if path not in (PACKAGE / "__init__.py", PACKAGE / "__main__.py")]

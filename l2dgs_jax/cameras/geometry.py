@@ -11,11 +11,21 @@ from l2dgs_jax.types import Camera
 
 AnyArray = TypeVar("AnyArray", Array, np.ndarray)
 
+OPENGL_AXES = np.diag([1.0, -1.0, -1.0, 1.0])  # of a camera (right, up, back) from OpenCV's (right, down, forward)
+
 
 def camera_centres(viewmats: AnyArray) -> AnyArray:
     """Centres [*B 3] of cameras in world units, of rigid `viewmats` [*B 4 4]; carries gradients."""
     # Sums of products and not a matrix product, which accelerators round to few digits.
     return -(viewmats[..., :3, :3] * viewmats[..., :3, 3:]).sum(-2)
+
+
+def mean_up(viewmats: Float[np.ndarray, "F 4 4"]) -> Float[np.ndarray, "3"]:
+    """The unit vector that cameras hold upwards on average; the first camera's if they do not agree at all."""
+    ups = -np.asarray(viewmats[:, 1, :3], np.float64)
+    mean = ups.mean(0)
+    length = np.linalg.norm(mean)
+    return mean / length if length > 1e-6 else ups[0]
 
 
 def camera_extent(cameras: Camera) -> float:

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 
-from l2dgs_jax.cameras.geometry import camera_centres
+from l2dgs_jax.cameras.geometry import camera_centres, mean_up
 from l2dgs_jax.types import Camera
 
 ALL_AROUND = np.radians(120)  # cameras stand around a scene if no gap between them is wider, seen from its middle
@@ -93,10 +93,7 @@ def orbit(cameras: Camera, depth: float, times: Float[np.ndarray, " T"]) -> Came
     viewmats = np.asarray(cameras.viewmat, np.float64)
     centres, target = camera_centres(viewmats), centre_of_attention(cameras, depth)
     central = _most_central(centres)
-    up = -viewmats[:, 1, :3].mean(0)
-    if np.linalg.norm(up) < 0.1:  # the views have no up in common
-        up = -viewmats[central, 1, :3]
-    up /= np.linalg.norm(up)
+    up = mean_up(viewmats)
     heights = (centres - target) @ up
     level = centres - target - np.outer(heights, up)
     radii = np.linalg.norm(level, axis=-1)

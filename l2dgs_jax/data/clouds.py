@@ -97,6 +97,13 @@ def read_ply(path: Path) -> Cloud:
 
 def write_ply(path: Path, points: Float[np.ndarray, "P 3"], colors: Float[np.ndarray, "P 3"] | None) -> None:
     """Write points in single precision and 8-bit colours."""
+    path.write_bytes(encode_ply(colored_points(points, colors)))
+
+
+def colored_points(
+    points: Float[np.ndarray, "P 3"], colors: Float[np.ndarray, "P 3"] | None
+) -> Shaped[np.ndarray, " P"]:
+    """The rows of a PLY file of points in single precision and 8-bit colours."""
     kind = [(axis, "<f4") for axis in "xyz"] + [(name, "u1") for name in ("red", "green", "blue") if colors is not None]
     rows = np.empty(len(points), kind)
     for i, axis in enumerate("xyz"):
@@ -104,10 +111,16 @@ def write_ply(path: Path, points: Float[np.ndarray, "P 3"], colors: Float[np.nda
     if colors is not None:
         for i, name in enumerate(("red", "green", "blue")):
             rows[name] = np.rint(255 * colors[:, i])
-    names = {"<f4": "float", "u1": "uchar"}
-    properties = "".join(f"property {names[form]} {name}\n" for name, form in kind)
-    head = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(points)}\n{properties}end_header\n"
-    path.write_bytes(head.encode() + rows.tobytes())
+    return rows
+
+
+def encode_ply(vertices: Shaped[np.ndarray, " P"]) -> bytes:
+    """A binary PLY file of vertices, whose fields are little-endian floats or bytes."""
+    names = {"<f4": "float", "|u1": "uchar"}
+    fields = [(name, vertices.dtype[name].str) for name in vertices.dtype.names or ()]
+    properties = "".join(f"property {names[form]} {name}\n" for name, form in fields)
+    head = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(vertices)}\n{properties}end_header\n"
+    return head.encode() + vertices.tobytes()
 
 
 def _vertices(lines: Sequence[Sequence[str]], body: bytes) -> Shaped[np.ndarray, " P"]:

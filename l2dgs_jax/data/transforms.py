@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
+from l2dgs_jax.cameras.geometry import OPENGL_AXES
 from l2dgs_jax.data import clouds, splits
 from l2dgs_jax.data.assembly import Frame, assemble
 from l2dgs_jax.data.dataset import Dataset
@@ -29,7 +30,6 @@ from l2dgs_jax.runtime.files import new_folder, write_json
 
 Entry = tuple[Path, dict[str, Any], Path]  # the file that lists a frame, what it says of it, and the frame's picture
 
-_AXES = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL's camera axes from OpenCV's, and back
 _PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
 _FISHEYE = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 
@@ -83,7 +83,7 @@ def write(dataset: Dataset, folder: Path) -> None:
             raise UserError("--to transforms: some pixels of the scene are not valid; expected nerfies, colmap or llff")
         for name, viewmat, K, time in zip(split.names, *split.cameras, strict=True):
             files[part].append(f"images/{name}.png")
-            world = np.linalg.inv(np.asarray(viewmat, np.float64)) @ _AXES
+            world = np.linalg.inv(np.asarray(viewmat, np.float64)) @ OPENGL_AXES
             intrinsics = dict(zip(("fl_x", "fl_y", "cx", "cy"), map(float, (K[0, 0], K[1, 1], *K[:2, 2])), strict=True))
             entry = {"file_path": files[part][-1], "time": float(time), "transform_matrix": world.tolist()}
             frames.append(entry | intrinsics)
@@ -117,7 +117,7 @@ def world_to_camera(source: str, key: str, matrix: Float64[np.ndarray, "4 4"]) -
     rotation(f"{source}: '{key}'", matrix[:3, :3])
     if not np.allclose(matrix[3], [0, 0, 0, 1]):
         raise UserError(f"{source}: the last row of '{key}' is {matrix[3]}; expected 0 0 0 1")
-    return np.linalg.inv(matrix @ _AXES)
+    return np.linalg.inv(matrix @ OPENGL_AXES)
 
 
 def _entries(folder: Path) -> tuple[dict[str, Entry], Lists, str | None]:

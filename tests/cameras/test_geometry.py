@@ -7,6 +7,7 @@ from jax.test_util import check_grads
 from scipy.spatial.transform import Rotation
 
 from l2dgs_jax.cameras import camera_centres, camera_extent, median_depth, reframe, resize, select_camera
+from l2dgs_jax.cameras.geometry import mean_up
 from l2dgs_jax.types import Camera
 
 
@@ -34,6 +35,16 @@ def test_the_extent_is_the_radius_with_a_margin():
     circle = np.array([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]]) + 7
     np.testing.assert_allclose(camera_extent(cameras(circle)), 1.1)
     assert camera_extent(cameras(circle[:1])) == 0
+
+
+def test_cameras_all_around_agree_on_up():
+    world = Rotation.from_rotvec([0.4, -1.1, 0.7])
+    headings = Rotation.from_euler("YX", [[angle, 0.6] for angle in (0, np.pi / 2, np.pi, -np.pi / 2)])
+    viewmats = np.tile(np.eye(4), (4, 1, 1))
+    viewmats[:, :3, :3] = (world * headings).inv().as_matrix()
+    np.testing.assert_allclose(mean_up(viewmats), world.apply([0, -1, 0]), atol=1e-12)  # y points down
+    upside_down = np.diag([-1, -1, 1, 1]) @ viewmats[:1]
+    np.testing.assert_allclose(np.linalg.norm(mean_up(np.concatenate([viewmats[:1], upside_down]))), 1)
 
 
 def test_a_resized_camera_sees_the_same():

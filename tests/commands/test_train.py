@@ -20,10 +20,9 @@ from l2dgs_jax.data import load_dataset
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.runs import checkpoints, open_run
 from l2dgs_jax.runtime import command_line, devices
-from l2dgs_jax.training import engine
-from l2dgs_jax.visualize.video import video_path
 from l2dgs_jax.runtime.locks import locked
 from l2dgs_jax.training import engine, resolve
+from l2dgs_jax.visualize.video import video_path
 
 TINY = [
     "--coarse-steps=5",

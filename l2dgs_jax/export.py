@@ -1,0 +1,142 @@
+"""`python -m l2dgs_jax.export RUN --to FORMAT`: the well-lit scene, or a camera path, for other programs."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import tyro
+from tqdm import tqdm
+
+from l2dgs_jax.cameras.geometry import mean_up
+from l2dgs_jax.errors import UserError
+from l2dgs_jax.exporters import antimatter15, gltf, ply
+from l2dgs_jax.exporters.baking import OVERBRIGHT, bake
+from l2dgs_jax.exporters.camera_path import camera_path
+from l2dgs_jax.exporters.model_arrays import model_arrays
+from l2dgs_jax.exporters.splats import Splats, visible
+from l2dgs_jax.runs import Run, open_run
+from l2dgs_jax.runs.views import get_split
+from l2dgs_jax.runtime import command_line
+from l2dgs_jax.runtime.files import make_folder, new_folder, replacing, write_json
+
+FILES = {  # what is written if --output says nothing else
+    "ply": "scene.ply",
+    "splat": "scene.splat",
+    "gltf": "scene.glb",
+    "cloud": "cloud.ply",
+    "npz": "scene.npz",
+    "cameras": "camera_path.json",
+}
+TIMELESS = ("npz", "cameras")
+IN_BYTES = ("splat", "cloud")  # which is how they hold colours: nothing is brighter than white
+
+
+@dataclass(frozen=True)
+class Export:
+    """Write a run's well-lit scene at an instant, or at many, for viewers of Gaussian splats; or all of it, as arrays.
+
+    Colours are baked: each Gaussian gets the one that shows the well-lit images best. How close they come is printed.
+
+    Attributes:
+        run: folder of the run.
+        to: Gaussians as a "ply" of 3D Gaussian Splatting, a "splat" of antimatter15's viewer or a "gltf" with
+            KHR_gaussian_splatting; a point "cloud" (.ply); the whole model as arrays ("npz"); or the "cameras" of a
+            split as a path for nerfstudio.
+        output: file to write, or folder with --times; in RUN/exports if not given.
+        time: instant to write, from 0 (first frame) to 1 (last frame); 0.5 if not given.
+        times: how many instants to write instead, spread evenly from 0 to 1: frame0001, frame0002 ... in a new folder.
+        split: whose cameras.
+        fps: frames a second of the path of cameras.
+        stage: the last checkpoint, or the one at the end of the coarse stage.
+    """
+
+    run: tyro.conf.Positional[Path]
+    to: Literal["ply", "splat", "gltf", "cloud", "npz", "cameras"]
+    output: Path | None = None
+    time: float | None = None
+    times: int | None = None
+    split: Literal["train", "test"] = "train"
+    fps: int = 24
+    stage: Literal["final", "coarse"] = "final"
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Export as the command line says."""
+    options = command_line.parse(Export, arguments, "export")
+    _check(options)
+    run = open_run(options.run, options.stage)
+    path = options.output or options.run / "exports" / (FILES[options.to] if options.times is None else options.to)
+    make_folder(path.parent)
+    if options.to == "cameras":
+        split = get_split(run, options.split)
+        write_json(path, camera_path(split.cameras, run.dataset.width, run.dataset.height, options.fps))
+        print(f"wrote {len(split.names)} cameras to {path}")
+    elif options.to == "npz":
+        arrays = model_arrays(run)
+        with replacing(path) as temporary:
+            np.savez(temporary, **arrays)  # type: ignore[arg-type]
+        print(f"wrote {len(arrays)} arrays to {path}")
+    else:
+        _write_splats(run, options, path)
+
+
+def _check(options: Export) -> None:
+    """Complain of options that are out of range or do not go together, before anything is read."""
+    instants = {name: value for name, value in (("time", options.time), ("times", options.times)) if value is not None}
+    for name, value in instants.items():
+        if options.to in TIMELESS:
+            others = ", ".join(to for to in FILES if to not in TIMELESS)
+            raise UserError(f"--{name} {value}: {options.to} covers all instants; expected it with one of {others}")
+    if len(instants) == 2:
+        raise UserError(f"--times {options.times}: given beside --time {options.time}; expected one of the two")
+    if options.time is not None and not 0 <= options.time <= 1:
+        raise UserError(f"--time {options.time}: expected an instant from 0, the first frame, to 1, the last")
+    for name, count in (("times", options.times), ("fps", options.fps)):
+        if count is not None and count < 1:
+            raise UserError(f"--{name} {count}: expected a whole number from 1")
+    suffix = Path(FILES[options.to]).suffix
+    if options.output and options.times is None and options.output.suffix != suffix:
+        raise UserError(f"--output {options.output}: expected a file name that ends in {suffix}")
+
+
+def _write_splats(run: Run, options: Export, path: Path) -> None:
+    """Bake and write one file, or a folder of them."""
+    encoders: dict[str, Callable[[Splats], bytes]] = {
+        "ply": ply.encode,
+        "splat": antimatter15.encode,
+        "gltf": partial(gltf.encode, up=mean_up(np.asarray(run.dataset.train.cameras.viewmat))),
+        "cloud": ply.encode_cloud,
+    }
+    sequence = options.times is not None
+    middle = 0.5 if options.time is None else options.time
+    times = np.linspace(0, 1, options.times).tolist() if options.times else [middle]
+    brightest = 1.0 if options.to in IN_BYTES else OVERBRIGHT
+    counts, scores = [], []
+    with new_folder(path) if sequence else replacing(path) as target:
+        baked = bake(run, times, brightest)
+        baked = tqdm(baked, total=len(times), desc="export", unit="instant", dynamic_ncols=True)
+        for number, (splats, score) in enumerate(baked, 1):
+            shown = visible(splats)
+            if not len(shown.means):
+                raise UserError(f"{run.name}: nothing is visible at time {times[number - 1]}; expected a trained scene")
+            file = target / f"frame{number:04d}{Path(FILES[options.to]).suffix}" if sequence else target
+            file.write_bytes(encoders[options.to](shown))
+            counts.append(len(shown.means))
+            scores.append(score)
+    files = f"{len(times)} files of " if sequence else ""
+    total = len(splats.means)
+    print(f"wrote {files}{_range(counts, 'd')} visible Gaussians, of {total} in all, to {path}")
+    if options.to != "cloud":
+        print(f"PSNR of their images against the exact well-lit images: {_range(scores, '.2f')} dB")
+
+
+def _range(values: Sequence[int] | Sequence[float], form: str) -> str:
+    low, high = format(min(values), form), format(max(values), form)
+    return low if low == high else f"{low} to {high}"
+
+
+if __name__ == "__main__":
+    command_line.run(main, huge_pages=True)

@@ -1,0 +1,1 @@
+"""Trained scenes in the formats of other programs."""

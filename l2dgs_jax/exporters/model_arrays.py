@@ -1,0 +1,53 @@
+"""A whole scene, decomposed and moving, as named arrays that say all it takes to render it."""
+
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Shaped
+
+from l2dgs_jax.data.dataset import Split
+from l2dgs_jax.model.deformation import length_unit
+from l2dgs_jax.rasterizer.projection import NEAR_PLANE
+from l2dgs_jax.runs import Run
+
+
+def model_arrays(run: Run) -> dict[str, Shaped[np.ndarray, "..."]]:
+    """The arrays of an exported .npz by name, numbers in single precision; docs/export.md describes each of them."""
+    scene, cfg, dataset = run.state.scene, run.config.model, run.dataset
+    params, alive = scene.params, np.asarray(scene.alive)
+    gaussians = {name: rows for name, rows in params.gaussians._asdict().items() if rows is not None}
+    coefficients = [gaussians.pop("illumination_dc"), gaussians.pop("illumination_rest")]
+    gaussians["illumination"] = np.concatenate(coefficients, axis=-1)[:, : (run.renderer().sh_degree + 1) ** 2]
+    unit = length_unit(scene.extent, cfg)
+    tree: dict[str, Any] = {
+        "gaussians": {name: np.asarray(rows)[alive] for name, rows in gaussians.items()},
+        "hexplane": params.hexplane,
+        "heads": params.heads,
+        "ocd": params.ocd,
+        "bafe": params.bafe,
+        "bounds": scene.bounds,
+        "length_unit": unit,
+        "near_plane": NEAR_PLANE * unit,
+        "moving": run.moving,
+        "aggregation": cfg.aggregation,
+        "time_range": cfg.time_range,
+        "box_rim": cfg.box_rim,
+        "illumination_offset": cfg.illumination_offset,
+        "background": cfg.background,
+        "width": dataset.width,
+        "height": dataset.height,
+        "train": _cameras(dataset.train),
+        "test": _cameras(dataset.test),
+    }
+    leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
+    return {jax.tree_util.keystr(path, simple=True, separator="/"): _single(leaf) for path, leaf in leaves}
+
+
+def _cameras(split: Split) -> dict[str, Any]:
+    return {"names": np.array(split.names, str), **split.cameras._asdict()}
+
+
+def _single(leaf: Any) -> Shaped[np.ndarray, "..."]:
+    array = np.asarray(leaf)
+    return array.astype(np.float32) if array.dtype.kind == "f" else array

@@ -1,0 +1,146 @@
+"""The command that writes a run for other programs."""
+
+import json
+import subprocess
+import sys
+
+import finished_run
+import numpy as np
+import pytest
+
+from l2dgs_jax import export
+from l2dgs_jax.data import clouds
+from l2dgs_jax.exporters.baking import Baked
+from l2dgs_jax.exporters.splats import Splats
+from l2dgs_jax.runtime import command_line
+
+SUFFIXES = {"ply": ".ply", "splat": ".splat", "gltf": ".glb", "cloud": ".ply"}
+
+
+@pytest.fixture(autouse=True)
+def _no_compilation_cache(monkeypatch):
+    monkeypatch.setenv("L2DGS_JAX_CACHE", "off")
+
+
+@pytest.fixture
+def run_folder(tmp_path_factory):
+    return finished_run.folder(tmp_path_factory.getbasetemp())
+
+
+@pytest.fixture
+def baked_times(monkeypatch):
+    """In place of baking, which has its own tests: three Gaussians that move by the instant, one of them invisible."""
+    times = []
+
+    def bake(run, instants, brightest):
+        assert brightest >= 1
+        for time in instants:
+            times.append(time)
+            means = np.full((3, 3), time, np.float32)
+            quats = np.tile(np.array([[1, 0, 0, 0]], np.float32), (3, 1))
+            opacities = np.array([0.5, 0.001, 1], np.float32)
+            yield Baked(Splats(means, quats, means + 1, opacities, 0 * means + np.float32(0.25)), 30 + time)
+
+    monkeypatch.setattr(export, "bake", bake)
+    return times
+
+
+def run_command(run_folder, *arguments):
+    command_line.run(export.main, [str(run_folder), *map(str, arguments)])
+
+
+@pytest.mark.parametrize("format", SUFFIXES)
+def test_one_instant_goes_to_one_file(run_folder, baked_times, tmp_path, capsys, format):
+    path = tmp_path / "made" / f"it{SUFFIXES[format]}"
+    run_command(run_folder, "--to", format, "--time", 0.25, "--output", path)
+    assert baked_times == [0.25]
+    assert [p.name for p in path.parent.iterdir()] == [path.name]
+    output = capsys.readouterr().out
+    assert f"wrote 2 visible Gaussians, of 3 in all, to {path}" in output
+    assert ("30.25 dB" in output) == (format != "cloud")
+
+
+def test_many_instants_go_to_a_folder_that_counts_them(run_folder, baked_times, tmp_path, capsys):
+    run_command(run_folder, "--to", "cloud", "--times", 5, "--output", tmp_path / "frames")
+    assert baked_times == [0, 0.25, 0.5, 0.75, 1]
+    files = sorted((tmp_path / "frames").iterdir())
+    assert [file.name for file in files] == [f"frame{i:04d}.ply" for i in range(1, 6)]
+    for file, time in zip(files, baked_times, strict=True):
+        points, _ = clouds.read_ply(file)
+        assert (points == time).all()
+    assert f"wrote 5 files of 2 visible Gaussians, of 3 in all, to {tmp_path / 'frames'}" in capsys.readouterr().out
+
+
+def test_files_go_to_the_runs_folder_unless_told_otherwise(run_folder, baked_times):
+    run_command(run_folder, "--to", "splat")
+    run_command(run_folder, "--to", "splat", "--times", 1)
+    assert baked_times == [0.5, 0]
+    written = {str(p.relative_to(run_folder)) for p in (run_folder / "exports").rglob("*.splat")}
+    assert written == {"exports/scene.splat", "exports/splat/frame0001.splat"}
+
+
+def test_a_sequence_that_fails_leaves_nothing(run_folder, baked_times, tmp_path, monkeypatch, capsys):
+    canned = export.bake
+
+    def faint(run, times, brightest):
+        for (splats, psnr), time in zip(canned(run, times, brightest), times, strict=True):
+            yield Baked(splats._replace(opacities=splats.opacities * (time < 0.6)), psnr)
+
+    monkeypatch.setattr(export, "bake", faint)
+    with pytest.raises(SystemExit):
+        run_command(run_folder, "--to", "gltf", "--times", 3, "--output", tmp_path / "frames")
+    assert "nothing is visible at time 1.0; expected a trained scene" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_cameras_and_the_model(run_folder, tmp_path, capsys):
+    run = finished_run.opened(run_folder.parent)
+    run_command(run_folder, "--to", "cameras", "--split", "test", "--fps", 4, "--output", tmp_path / "path.json")
+    path = json.loads((tmp_path / "path.json").read_text())
+    assert len(path["camera_path"]) == len(run.dataset.test.names)
+    assert path["seconds"] == len(run.dataset.test.names) / 4
+    run_command(run_folder, "--to", "npz", "--output", tmp_path / "scene.npz", "--stage", "coarse")
+    with np.load(tmp_path / "scene.npz", allow_pickle=False) as model:
+        assert not model["moving"]
+        assert len(model["gaussians/means"]) == int(run.state.scene.alive.sum())
+    assert f"to {tmp_path / 'scene.npz'}" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--to", "ply", "--time", "1.5"], "--time 1.5: expected an instant from 0"),
+        (["--to", "ply", "--time", "nan"], "--time nan: expected an instant from 0"),
+        (["--to", "ply", "--times", "0"], "--times 0: expected a whole number from 1"),
+        (["--to", "ply", "--times", "3", "--time", "0"], "--times 3: given beside --time 0.0; expected one of the two"),
+        (
+            ["--to", "npz", "--time", "0.5"],
+            "--time 0.5: npz covers all instants; expected it with one of ply, splat, gltf, cloud",
+        ),
+        (["--to", "cameras", "--times", "2"], "--times 2: cameras covers all instants"),
+        (["--to", "cameras", "--fps", "0"], "--fps 0: expected a whole number from 1"),
+        (["--to", "gltf", "--output", "x.ply"], "--output x.ply: expected a file name that ends in .glb"),
+        (["--to", "ply", "--times", "2", "--output", "{full}"], "exists already; expected a new or an empty folder"),
+        (["--to", "ply", "--output", "{full}/note.txt/x.ply"], "expected a writable place"),
+    ],
+)
+def test_bad_input_is_one_sentence_and_exit_code_2(run_folder, baked_times, tmp_path, capsys, arguments, message):
+    (tmp_path / "note.txt").write_text("")
+    with pytest.raises(SystemExit) as leave:
+        run_command(run_folder, *(argument.format(full=tmp_path) for argument in arguments))
+    assert leave.value.code == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert len([line for line in error.splitlines() if line.startswith("error: ")]) == 1
+    assert not baked_times
+    assert [p.name for p in tmp_path.iterdir()] == ["note.txt"]
+
+
+@pytest.mark.slow
+def test_the_whole_way(run_folder, tmp_path):
+    """Baking included, in a process of its own, where floats have single precision."""
+    command = [sys.executable, "-m", "l2dgs_jax.export", str(run_folder), "--to", "ply", "--times", "2"]
+    done = subprocess.run([*command, "--output", str(tmp_path / "ply")], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "PSNR of their images against the exact well-lit images" in done.stdout
+    assert sorted(p.name for p in (tmp_path / "ply").iterdir()) == ["frame0001.ply", "frame0002.ply"]
