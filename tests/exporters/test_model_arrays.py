@@ -33,7 +33,8 @@ def test_every_array_is_documented_and_plain(run, tmp_path):
     with np.load(tmp_path / "scene.npz", allow_pickle=False) as model:
         assert [name for name in model if not any(re.fullmatch(pattern, name) for pattern in patterns)] == []
         unused = [pattern for pattern in patterns if not any(re.fullmatch(pattern, name) for name in model)]
-        assert all("gate" in pattern or "opacity" in pattern for pattern in unused)
+        optional = ("gate", "opacity", "paths", "lifetimes")
+        assert all(any(name in pattern for name in optional) for pattern in unused)
         assert all(model[name].dtype.kind in "biU" or model[name].dtype == np.float32 for name in model)
 
 
@@ -51,8 +52,14 @@ def test_the_documented_program_renders_the_model(run, variant, tmp_path, monkey
     rng = np.random.default_rng(0)
     shake = lambda x: x + jnp.asarray(rng.normal(0, 0.3, x.shape), x.dtype)
     params = jax.tree.map(shake, run.state.scene.params)
-    gate = jnp.asarray(rng.normal(0, 1, len(run.state.scene.alive)))
-    params = params._replace(gaussians=run.state.scene.params.gaussians._replace(gate=gate))
+    count = len(run.state.scene.alive)
+    lifetimes = np.where(np.arange(count)[:, None] % 3 > 0, [-np.inf, np.inf], [0.1, 0.9])
+    gaussians = run.state.scene.params.gaussians._replace(
+        gate=jnp.asarray(rng.normal(0, 1, count)),
+        paths=jnp.asarray(rng.normal(0, 0.05, (count, 5, 3))),
+        lifetimes=jnp.asarray(lifetimes),
+    )
+    params = params._replace(gaussians=gaussians)
     state = run.state._replace(scene=run.state.scene._replace(params=params))
     model = dataclasses.replace(run.config.model, **variant)
     run = dataclasses.replace(run, state=state, config=dataclasses.replace(run.config, model=model))
