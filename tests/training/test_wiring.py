@@ -204,10 +204,10 @@ def test_every_rate_moves_its_parameters_and_no_others(dataset):
         assert moved == {name}
 
 
-def test_a_scene_without_gate_and_exposures_has_no_rates_for_them(dataset):
-    """So that its checkpoints are those of versions before there was one."""
+def test_a_scene_has_no_rates_for_what_it_does_without(dataset):
+    """So that its checkpoints are those of versions before there were any."""
     rates = initial_state(dataset, config_of()).adam.schedules
-    assert rates.keys() == set(RATE_GROUPS) - {"gate", "exposures"}
+    assert rates.keys() == set(RATE_GROUPS) - {"gate", "paths", "lifetimes", "exposures"}
 
 
 def test_weights_on_sizes_and_the_gate(dataset):
