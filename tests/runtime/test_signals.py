@@ -11,6 +11,14 @@ import pytest
 from l2dgs_jax.runtime.signals import STOPPING, stop_requests
 
 
+@pytest.fixture(autouse=True)
+def heeded():
+    """Also where the tests run in a shell's background, which ignores interrupts."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 @pytest.mark.parametrize("number", STOPPING)
 def test_a_signal_is_a_request_and_its_handler_comes_back(number):
     noticed, before = threading.Event(), signal.getsignal(number)
