@@ -118,7 +118,7 @@ def tracked(monkeypatch):
     """Settings and a state that starts from the two seeds."""
     module = sys.modules["l2dgs_jax.training.initial_state"]  # its function has the same name
     monkeypatch.setattr(module, "find_seeds", lambda *_, most: SOME)
-    config = tiny()
+    config = tiny(coarse_steps=3, fine_steps=0)
     config = dataclasses.replace(config, model=dataclasses.replace(config.model, tracks=True))
     return config, initial_state(make_dataset(), config)
 
