@@ -16,13 +16,12 @@ from l2dgs_jax.data.dataset import Split
 from l2dgs_jax.model.deformation import path_weights
 from l2dgs_jax.model.initialisation import Seeds, path_knots, z_order
 from l2dgs_jax.training.flows import neighbour_flows
-from l2dgs_jax.training.tracks import SPACING, Tracks, find_tracks
+from l2dgs_jax.training.tracks import DEPTH_CELL, SPACING, Tracks, find_tracks
 
 SHORTEST = 3  # frames that a track must be seen in
 MOVING = 0.4  # part of them in which it must be seen to move
 STRAY = 3.0  # pixels by which it must leave where any still point would be seen
 LONG = 6  # observations from which the depth of a track may change
-DEPTH_CELL = 4  # pixels a side
 NEIGHBOURS = 30  # points around a pixel that depths are taken from
 RANGE = 0.03, 0.97  # quantiles of their depths, as a few points lie astray
 GUESSES = 4  # of a depth in that range
@@ -62,7 +61,7 @@ class _Cameras(NamedTuple):
     time: Float[np.ndarray, " F"]
 
 
-def _worthwhile(tracks: Tracks, cameras: _Cameras, depths: Float32[np.ndarray, "C F H W"], most: int) -> list[Tracks]:
+def _worthwhile(tracks: Tracks, cameras: _Cameras, depths: Float32[np.ndarray, "C F h w"], most: int) -> list[Tracks]:
     """The tracks, apart, that are long enough and lead away from where they would if their start stood still."""
     starts = np.flatnonzero(np.diff(tracks.numbers, prepend=-1))
     lengths = np.diff(starts, append=len(tracks.numbers))
@@ -80,7 +79,7 @@ def _worthwhile(tracks: Tracks, cameras: _Cameras, depths: Float32[np.ndarray, "
     return [Tracks(*(x[starts[i] : starts[i] + lengths[i]] for x in tracks)) for i in chosen]
 
 
-def _seed(split: Split, cameras: _Cameras, depths: Float32[np.ndarray, "F H W"], track: Tracks) -> Seeds:
+def _seed(split: Split, cameras: _Cameras, depths: Float32[np.ndarray, "F h w"], track: Tracks) -> Seeds:
     """What one track says, the middle of it being where the Gaussian is."""
     frames, instants = track.frames, np.unique(cameras.time)
     times, found = cameras.time[frames], _at(track, depths)
@@ -116,25 +115,24 @@ def _depths(
     K: Float[np.ndarray, "3 3"],
     height: int,
     width: int,
-) -> Float32[np.ndarray, "C H W"]:
-    """Depths that the points around each pixel have, the nearest first, world units; NaN if none are in view."""
+) -> Float32[np.ndarray, "C h w"]:
+    """Depths that the points around each cell have, the nearest first, world units; NaN if none are in view."""
     local = points @ viewmat[:3, :3].T + viewmat[:3, 3]
     local = local[local[:, 2] > 0]
     pixels = (local @ K.T)[:, :2] / local[:, 2:]
     inside = ((pixels > -BESIDE) & (pixels < (width + BESIDE, height + BESIDE))).all(-1)
-    if not inside.any():
-        return np.full((GUESSES, height, width), np.nan, np.float32)
     rows, columns = (np.arange(0, size, DEPTH_CELL) + 0.5 * DEPTH_CELL for size in (height, width))
+    if not inside.any():
+        return np.full((GUESSES, len(rows), len(columns)), np.nan, np.float32)
     cells = np.stack(np.meshgrid(columns, rows), axis=-1)
     _, around = cKDTree(pixels[inside]).query(cells, k=range(1, min(NEIGHBOURS, int(inside.sum())) + 1))
     near, far = np.quantile(local[inside, 2][around], RANGE, axis=-1)
-    guesses = 1 / np.linspace(1 / near, 1 / far, GUESSES)
-    return np.repeat(np.repeat(guesses, DEPTH_CELL, 1), DEPTH_CELL, 2)[:, :height, :width].astype(np.float32)
+    return (1 / np.linspace(1 / near, 1 / far, GUESSES)).astype(np.float32)
 
 
-def _at(tracks: Tracks, values: Float32[np.ndarray, "F H W"]) -> Float32[np.ndarray, " O"]:
-    columns, rows = tracks.pixels.astype(int).T
-    return values[tracks.frames, rows, columns]
+def _at(tracks: Tracks, depths: Float32[np.ndarray, "F h w"]) -> Float32[np.ndarray, " O"]:
+    columns, rows = (tracks.pixels // DEPTH_CELL).astype(int).T
+    return depths[tracks.frames, rows, columns]
 
 
 def _lift(tracks: Tracks, cameras: _Cameras, depth: Float[np.ndarray, " O"]) -> Float[np.ndarray, "O 3"]:

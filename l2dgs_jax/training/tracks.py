@@ -16,6 +16,7 @@ SPACING = 3  # pixels between tracks, at their start and where they meet
 APART = 1.0  # pixels by which flow must differ from what a still scene would show
 NEIGHBOURHOOD = 5  # pixels a side that pictures are compared over
 HOLES = 7  # pixels a side, of what is filled in amid moving pixels
+DEPTH_CELL = 4  # pixels a side of a square that has one depth
 FORGETTING = 0.3  # weight of the last step in how fast a track strays
 
 
@@ -35,7 +36,7 @@ class Tracks(NamedTuple):
     moves: Bool[np.ndarray, " O"]
 
 
-def find_tracks(split: Split, flows: Flows, depths: Float32[np.ndarray, "C F H W"]) -> Tracks:
+def find_tracks(split: Split, flows: Flows, depths: Float32[np.ndarray, "C F h w"]) -> Tracks:
     """Follow what moves from frame to frame, as long as flow can be trusted.
 
     A track begins wherever something moves and none is near, so that together they cover it at every instant. Where two
@@ -44,7 +45,8 @@ def find_tracks(split: Split, flows: Flows, depths: Float32[np.ndarray, "C F H W
     Args:
         split: the frames.
         flows: between them.
-        depths: those that a still scene may have in each of them, C guesses, world units; NaN where nothing is known.
+        depths: those that a still scene may have in cells of each of them, C guesses, world units; NaN where nothing is
+            known.
     """
     times, (height, width) = np.asarray(split.cameras.time), split.images.shape[1:3]
     greys = brightened(split.images)
@@ -76,7 +78,8 @@ def find_tracks(split: Split, flows: Flows, depths: Float32[np.ndarray, "C F H W
             continue
 
         geometry, pixels = epipolar_geometry(split.cameras, frame, following), _pixels(height, width)
-        places = [project(geometry, pixels, 1 / depth).astype(np.float32) for depth in depths[:, frame]]
+        nearness = 1 / depths[:, frame].repeat(DEPTH_CELL, 1).repeat(DEPTH_CELL, 2)[:, :height, :width]
+        places = [project(geometry, pixels, guess).astype(np.float32) for guess in nearness]
         flow = flows.displacements[frame, 0].astype(np.float32)
         strays, moves = _moving(greys[frame], greys[following], places, pixels + flow)
         if split.valid is not None:
