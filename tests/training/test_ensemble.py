@@ -169,5 +169,5 @@ def _all_changed(config: Config) -> Config:
     """A config that differs in every number of `TRACED`."""
     shift = lambda value: tuple(map(shift, value)) if isinstance(value, tuple) else value + 1
     values = {name: value for name, (value, _) in overrides.differences([config, overrides.outline(config)]).items()}
-    zeros = {name: overrides._read(config, name) for name in overrides.TRACED - set(values)}
+    zeros = {name: overrides.read(config, name) for name in overrides.TRACED - set(values)}
     return overrides.replace(config, {name: shift(value) for name, value in (values | zeros).items()})
