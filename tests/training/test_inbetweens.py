@@ -148,6 +148,7 @@ def test_without_any_the_frames_are_all_there_is(split):
     assert batch.valid is None
 
 
+@pytest.mark.slow
 def test_a_training_with_them_resumes_where_it_stopped():
     dataset, config = make_dataset(), tiny(inbetweens=0.9, coarse_steps=0, fine_steps=4)
     steps = engine.run([engine.Member(dataset.train, config, initial_state(dataset, config))])

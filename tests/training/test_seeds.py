@@ -137,6 +137,7 @@ def test_a_training_starts_with_the_seeds_after_the_points(tracked):
     assert np.isinf(scene.params.gaussians.lifetimes[:points]).all()
 
 
+@pytest.mark.slow
 def test_only_seeds_learn_their_paths(tracked):
     config, start = tracked
     end = state_of(finish(make_dataset(), config, start)).scene
