@@ -44,9 +44,11 @@ def find_seeds(points: Float[np.ndarray, "P 3"], split: Split, most: int) -> See
     height, width = split.images.shape[1:3]
     depths = np.stack([_depths(points, *camera[:2], height, width) for camera in zip(*cameras, strict=True)], axis=1)
     tracks = find_tracks(split, neighbour_flows(split), depths)
-    seeds = [_seed(split, cameras, depths[0], track) for track in _worthwhile(tracks, cameras, depths, most)]
+    knots = path_knots(len(cameras.time))
+    weights = np.asarray(path_weights(jnp.asarray(cameras.time), knots))
+    seeds = [_seed(split, cameras, depths[0], weights, track) for track in _worthwhile(tracks, cameras, depths, most)]
     if not seeds:
-        shapes = ((0, 3), (0, 3), (0,), (0, path_knots(len(cameras.time)), 3), (0, 2))
+        shapes = ((0, 3), (0, 3), (0,), (0, knots, 3), (0, 2))
         return Seeds(*(np.zeros(shape, np.float32) for shape in shapes))
     found = Seeds(*(np.array(rows, np.float32) for rows in zip(*seeds, strict=True)))
     order = z_order(found.points)
@@ -79,7 +81,13 @@ def _worthwhile(tracks: Tracks, cameras: _Cameras, depths: Float32[np.ndarray, "
     return [Tracks(*(x[starts[i] : starts[i] + lengths[i]] for x in tracks)) for i in chosen]
 
 
-def _seed(split: Split, cameras: _Cameras, depths: Float32[np.ndarray, "F h w"], track: Tracks) -> Seeds:
+def _seed(
+    split: Split,
+    cameras: _Cameras,
+    depths: Float32[np.ndarray, "F h w"],
+    weights: Float[np.ndarray, "F K"],
+    track: Tracks,
+) -> Seeds:
     """What one track says, the middle of it being where the Gaussian is."""
     frames, instants = track.frames, np.unique(cameras.time)
     times, found = cameras.time[frames], _at(track, depths)
@@ -91,13 +99,12 @@ def _seed(split: Split, cameras: _Cameras, depths: Float32[np.ndarray, "F h w"],
     # It is there half of the time to the frames in which it is seen no more.
     first, last = np.searchsorted(instants, times[[0, -1]]).tolist()
     before, after = instants[max(first - 1, 0)], instants[min(last + 1, len(instants) - 1)]
-    weights = np.asarray(path_weights(jnp.asarray(times), path_knots(len(cameras.time))))
     columns, rows = track.pixels.astype(int).T
     return Seeds(
         points=way[middle],
         colors=np.median(split.images[frames, rows, columns], axis=0),
         spacings=SPACING * depth[middle] / cameras.K[frames[middle], 0, 0],
-        paths=_fitted(weights, way - way[middle]),
+        paths=_fitted(weights[frames], way - way[middle]),
         lifetimes=np.array([before + times[0], times[-1] + after]) / 2,
     )
 
