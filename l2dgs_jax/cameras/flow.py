@@ -44,11 +44,16 @@ def optical_flow(
     return search.calc(first, second, None)  # type: ignore[call-overload]
 
 
+def pixel_indices(height: int, width: int) -> Float32[np.ndarray, "H W 2"]:
+    """Column and row of every pixel; their centres lie at +0.5."""
+    columns, rows = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+    return np.stack([columns, rows], axis=-1)
+
+
 def match(there: Float32[np.ndarray, "H W 2"], back: Float32[np.ndarray, "H W 2"]) -> Matches:
     """Matches from flow to another view and from there back."""
     height, width = there.shape[:2]
-    columns, rows = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
-    ends = there + np.stack([columns, rows], axis=-1)
+    ends = there + pixel_indices(height, width)
     returned = cv2.remap(back, ends[..., 0], ends[..., 1], cv2.INTER_LINEAR)
     left = (ends < 0).any(-1) | (ends > (width - 1, height - 1)).any(-1)
     errors = np.where(left, np.float32(2 * LOST), np.linalg.norm(there + returned, axis=-1))

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float16, Float32
 
+from l2dgs_jax.cameras.flow import pixel_indices
 from l2dgs_jax.cameras.geometry import between
 from l2dgs_jax.data.dataset import Split
 from l2dgs_jax.training.flows import Flows
@@ -60,7 +61,7 @@ def _warped(
 ) -> tuple[Float32[np.ndarray, "H W 3"], Bool[np.ndarray, "H W"]]:
     """The image seen at each pixel plus its flow, and where that is known."""
     height, width = image.shape[:2]
-    at = flow + np.stack(np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32)), axis=-1)
+    at = flow + pixel_indices(height, width)
     known: np.ndarray = np.all((at >= 0) & (at <= (width - 1, height - 1)), axis=-1)  # not where flow is NaN
     at = np.where(known[..., None], at, 0)
     return cv2.remap(image, at[..., 0], at[..., 1], cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REPLICATE), known

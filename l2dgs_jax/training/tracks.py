@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from l2dgs_jax.cameras.epipolar import epipolar_geometry, project
-from l2dgs_jax.cameras.flow import brightened
+from l2dgs_jax.cameras.flow import brightened, pixel_indices
 from l2dgs_jax.data.dataset import Split
 from l2dgs_jax.training.flows import Flows
 
@@ -50,7 +50,8 @@ def find_tracks(split: Split, flows: Flows, depths: Float32[np.ndarray, "C F h w
     """
     times, (height, width) = np.asarray(split.cameras.time), split.images.shape[1:3]
     greys = brightened(split.images)
-    grid = _pixels(height, width)[SPACING // 2 :: SPACING, SPACING // 2 :: SPACING].reshape(-1, 2).astype(np.float64)
+    pixels = pixel_indices(height, width) + np.float32(0.5)
+    grid = pixels[SPACING // 2 :: SPACING, SPACING // 2 :: SPACING].reshape(-1, 2).astype(np.float64)
 
     def cell(pixels: Float[np.ndarray, "N 2"]) -> Int[np.ndarray, " N"]:
         column, row = (pixels // SPACING).astype(int).T
@@ -77,7 +78,7 @@ def find_tracks(split: Split, flows: Flows, depths: Float32[np.ndarray, "C F h w
             observed.append(Tracks(heads.numbers, np.full(len(still), frame), heads.pixels, still))
             continue
 
-        geometry, pixels = epipolar_geometry(split.cameras, frame, following), _pixels(height, width)
+        geometry = epipolar_geometry(split.cameras, frame, following)
         nearness = 1 / depths[:, frame].repeat(DEPTH_CELL, 1).repeat(DEPTH_CELL, 2)[:, :height, :width]
         places = [project(geometry, pixels, guess).astype(np.float32) for guess in nearness]
         flow = flows.displacements[frame, 0].astype(np.float32)
@@ -131,12 +132,6 @@ def _moving(
     believed = (strays > APART) & (np.min([difference(places) for places in still], axis=0) - unlike > usual)
     filled = cv2.morphologyEx(believed.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((HOLES, HOLES), np.uint8)) > 0
     return strays, filled & (strays > APART)
-
-
-def _pixels(height: int, width: int) -> Float32[np.ndarray, "H W 2"]:
-    """The pixel centres."""
-    columns, rows = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
-    return np.stack([columns, rows], axis=-1) + np.float32(0.5)
 
 
 def _at(values: np.ndarray, pixels: Float[np.ndarray, "N 2"]) -> np.ndarray:

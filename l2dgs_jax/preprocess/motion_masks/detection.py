@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
 from l2dgs_jax.cameras.epipolar import EpipolarGeometry, epipolar_geometry, project, static_residuals
-from l2dgs_jax.cameras.flow import LOST, Matches, brightened, match, optical_flow
+from l2dgs_jax.cameras.flow import LOST, Matches, brightened, match, optical_flow, pixel_indices
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.types import Camera
 
@@ -121,8 +121,7 @@ def contradiction(
         Values in [0, 1].
     """
     height, width = matches.errors.shape[1:]
-    columns, rows = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
-    pixels = np.stack([columns, rows], axis=-1) + np.float32(0.5)
+    pixels = pixel_indices(height, width) + np.float32(0.5)
     residuals = static_residuals(geometry, pixels, matches.positions, depths)
     returned = matches.errors < 1
     sigmas = np.full(len(residuals[0]), ACCURACY, np.float32)
