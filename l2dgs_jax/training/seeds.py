@@ -9,31 +9,23 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Float32, Int
-from scipy.spatial import cKDTree
 
 from l2dgs_jax.cameras.geometry import camera_centres
 from l2dgs_jax.data.dataset import Split
 from l2dgs_jax.model.deformation import path_weights
 from l2dgs_jax.model.initialisation import Seeds, path_knots, z_order
+from l2dgs_jax.training.depths import depths_around, depths_at, shared_depths
 from l2dgs_jax.training.flows import neighbour_flows
-from l2dgs_jax.training.tracks import DEPTH_CELL, SPACING, Tracks, find_tracks
+from l2dgs_jax.training.tracks import SPACING, Tracks, find_tracks
 
 SHORTEST = 3  # frames that a track must be seen in
 MOVING = 0.4  # part of them in which it must be seen to move
 STRAY = 3.0  # pixels by which it must leave where any still point would be seen
-LONG = 6  # observations from which the depth of a track may change
-NEIGHBOURS = 30  # points around a pixel that depths are taken from
-RANGE = 0.03, 0.97  # quantiles of their depths, as a few points lie astray
-GUESSES = 4  # of a depth in that range
 STIFFNESS = 1e-3  # weight of the squared bends of a path against squared distances from what was tracked
-BESIDE = 20  # pixels beyond the border in which points still count
 
 
 def find_seeds(points: Float[np.ndarray, "P 3"], split: Split, most: int) -> Seeds:
     """Seeds on what moves between the frames; none where flow cannot tell.
-
-    What moves hides what stands behind it, so its depth is that of the nearest of the points around; it changes evenly
-    along a track.
 
     Args:
         points: of the scene, world units.
@@ -42,14 +34,17 @@ def find_seeds(points: Float[np.ndarray, "P 3"], split: Split, most: int) -> See
     """
     cameras = _Cameras(*(np.asarray(x, np.float64) for x in split.cameras))
     height, width = split.images.shape[1:3]
-    depths = np.stack([_depths(points, *camera[:2], height, width) for camera in zip(*cameras, strict=True)], axis=1)
-    tracks = find_tracks(split, neighbour_flows(split), depths)
+    around = [depths_around(points, *camera[:2], height, width) for camera in zip(*cameras, strict=True)]
+    still = np.stack([depths.still for depths in around], axis=1)
+    tracks = find_tracks(split, neighbour_flows(split), still)
     knots = path_knots(len(cameras.time))
     weights = np.asarray(path_weights(jnp.asarray(cameras.time), knots))
-    seeds = [_seed(split, cameras, depths[0], weights, track) for track in _worthwhile(tracks, cameras, depths, most)]
-    if not seeds:
+    chosen = _worthwhile(tracks, cameras, still, most)
+    if not chosen:
         shapes = ((0, 3), (0, 3), (0,), (0, knots, 3), (0, 2))
         return Seeds(*(np.zeros(shape, np.float32) for shape in shapes))
+    depths = shared_depths(chosen, np.stack([depths.moving for depths in around]))
+    seeds = [_seed(split, cameras, weights, *track) for track in zip(chosen, depths, strict=True)]
     found = Seeds(*(np.array(rows, np.float32) for rows in zip(*seeds, strict=True)))
     order = z_order(found.points)
     return Seeds(*(rows[order] for rows in found))
@@ -71,7 +66,7 @@ def _worthwhile(tracks: Tracks, cameras: _Cameras, depths: Float32[np.ndarray, "
         return []
     strays = []
     for depth in depths:
-        world = np.repeat(_lift(tracks, cameras, _at(tracks, depth))[starts], lengths, axis=0)
+        world = np.repeat(_lift(tracks, cameras, depths_at(tracks, depth))[starts], lengths, axis=0)
         apart = np.linalg.norm(tracks.pixels - _project(world, tracks.frames, cameras), axis=-1)
         strays.append(np.maximum.reduceat(apart, starts))
     moves = np.add.reduceat(tracks.moves, starts) / lengths
@@ -84,17 +79,13 @@ def _worthwhile(tracks: Tracks, cameras: _Cameras, depths: Float32[np.ndarray, "
 def _seed(
     split: Split,
     cameras: _Cameras,
-    depths: Float32[np.ndarray, "F h w"],
     weights: Float[np.ndarray, "F K"],
     track: Tracks,
+    depth: Float[np.ndarray, " O"],
 ) -> Seeds:
     """What one track says, the middle of it being where the Gaussian is."""
     frames, instants = track.frames, np.unique(cameras.time)
-    times, found = cameras.time[frames], _at(track, depths)
-    if len(frames) < LONG:
-        depth = np.full(len(frames), np.median(found))
-    else:
-        depth = np.polyval(np.polyfit(times, found, 1), times)
+    times = cameras.time[frames]
     way, middle = _lift(track, cameras, depth), len(frames) // 2
     # It is there half of the time to the frames in which it is seen no more.
     first, last = np.searchsorted(instants, times[[0, -1]]).tolist()
@@ -114,32 +105,6 @@ def _fitted(weights: Float[np.ndarray, "O K"], places: Float[np.ndarray, "O 3"])
     bends = np.diff(np.eye(weights.shape[1]), 2, axis=0)
     stiff = weights.T @ weights + STIFFNESS * bends.T @ bends
     return np.linalg.solve(stiff, weights.T @ places)
-
-
-def _depths(
-    points: Float[np.ndarray, "P 3"],
-    viewmat: Float[np.ndarray, "4 4"],
-    K: Float[np.ndarray, "3 3"],
-    height: int,
-    width: int,
-) -> Float32[np.ndarray, "C h w"]:
-    """Depths that the points around each cell have, the nearest first, world units; NaN if none are in view."""
-    local = points @ viewmat[:3, :3].T + viewmat[:3, 3]
-    local = local[local[:, 2] > 0]
-    pixels = (local @ K.T)[:, :2] / local[:, 2:]
-    inside = ((pixels > -BESIDE) & (pixels < (width + BESIDE, height + BESIDE))).all(-1)
-    rows, columns = (np.arange(0, size, DEPTH_CELL) + 0.5 * DEPTH_CELL for size in (height, width))
-    if not inside.any():
-        return np.full((GUESSES, len(rows), len(columns)), np.nan, np.float32)
-    cells = np.stack(np.meshgrid(columns, rows), axis=-1)
-    _, around = cKDTree(pixels[inside]).query(cells, k=range(1, min(NEIGHBOURS, int(inside.sum())) + 1))
-    near, far = np.quantile(local[inside, 2][around], RANGE, axis=-1)
-    return (1 / np.linspace(1 / near, 1 / far, GUESSES)).astype(np.float32)
-
-
-def _at(tracks: Tracks, depths: Float32[np.ndarray, "F h w"]) -> Float32[np.ndarray, " O"]:
-    columns, rows = (tracks.pixels // DEPTH_CELL).astype(int).T
-    return depths[tracks.frames, rows, columns]
 
 
 def _lift(tracks: Tracks, cameras: _Cameras, depth: Float[np.ndarray, " O"]) -> Float[np.ndarray, "O 3"]:
