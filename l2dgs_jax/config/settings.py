@@ -87,6 +87,8 @@ class ModelConfig:
     hidden: int = 128  # width of g, of the heads and of OCD-Net
     opacity_head: bool = False  # a fourth head moves the opacity's logit, as 4DGS can (arXiv 2310.08528)
     motion_gate: bool = False  # a factor a Gaussian in (0, 1) on all that the motion field does to it
+    # With gates: share of the Gaussians that the motion field acts on at once, those whose gates are open widest
+    moving_share: float = 1.0
     # Whether what moves starts as Gaussians with paths and lifetimes of their own, from tracks of optical flow
     # (training/seeds.py); the motion field acts on top
     tracks: bool = False

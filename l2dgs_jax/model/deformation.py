@@ -1,5 +1,8 @@
 """Canonical Gaussians and instants -> Gaussians at those instants, lit as their cameras see them (Eqs. 1-4)."""
 
+import math
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,7 +10,7 @@ from jaxtyping import Array, Float, Int
 
 from l2dgs_jax.cameras.geometry import camera_centres
 from l2dgs_jax.config import ModelConfig
-from l2dgs_jax.model import hexplane, networks, spherical_harmonics
+from l2dgs_jax.model import compaction, hexplane, networks, spherical_harmonics
 from l2dgs_jax.types import Camera, Gaussians, MovedGaussians, Scene
 
 FADING = 0.25  # time in which a Gaussian on a path comes or goes, over that between two control points
@@ -21,6 +24,7 @@ def deform(
     moving: bool,
     sh_degree_active: Int[Array, ""] | int,
     presence: Float[Array, " N"] | None = None,
+    chances: Float[Array, " N"] | None = None,
 ) -> MovedGaussians:
     """Move and light every Gaussian for V cameras, each at its own instant.
 
@@ -33,6 +37,8 @@ def deform(
         moving: whether the motion field and OCD-Net act (fine stage); otherwise only paths do, with a_j = 1.
         sh_degree_active: bands of Eq. 2 above this one are left out; may be traced.
         presence: factor on the opacities, which stay at most 1; None for 1.
+        chances: added to the logits of the gates where these decide which Gaussians the motion field acts on
+            (`cfg.moving_share`); None for 0.
 
     Returns:
         Activated Gaussians; every field has a leading axis V.
@@ -47,20 +53,13 @@ def deform(
     means, quats, log_scales, logit_opacities = map(per_view, raw)
     coefficients = _active_coefficients(gaussians, cfg.sh_degree, sh_degree_active)
     if moving:
-        # The same features feed the heads and OCD-Net: Eqs. 1 and 4 name them both f.
-        field = hexplane.features(params.hexplane, gaussians.means, scene.bounds, cameras.time, cfg)
-        hidden, motion = networks.apply_heads(params.heads, field)
-        factors = networks.apply_ocd(params.ocd, hidden)
-        if gaussians.gate is not None:
-            gate = jax.nn.sigmoid(gaussians.gate)[None]
-            motion = jax.tree.map(lambda change: gate.reshape(1, -1, *[1] * (change.ndim - 2)) * change, motion)
-            factors = 1 + gate[..., None] * (factors - 1)
-        means += length_unit(scene.extent, cfg) * motion.means
-        quats += motion.quats
-        log_scales += motion.log_scales
-        if motion.logit_opacities is not None:
-            logit_opacities += motion.logit_opacities
-        coefficients = factors * coefficients
+        changes = _changes(scene, gaussians, cameras, cfg, chances)
+        means += length_unit(scene.extent, cfg) * changes.motion.means
+        quats += changes.motion.quats
+        log_scales += changes.motion.log_scales
+        if changes.motion.logit_opacities is not None:
+            logit_opacities += changes.motion.logit_opacities
+        coefficients = (1 + changes.light) * coefficients
     opacities = jnp.where(alive[None], jax.nn.sigmoid(logit_opacities), 0)
     if gaussians.paths is not None and gaussians.lifetimes is not None:
         displacements, there = _on_paths(gaussians.paths, gaussians.lifetimes, cameras.time)
@@ -74,6 +73,35 @@ def deform(
         reflectance=per_view(gaussians.reflectance),
         attenuation=per_view(gaussians.attenuation),
     )
+
+
+class _Changes(NamedTuple):
+    motion: networks.Motion
+    light: Float[Array, "V N J"]  # a_j - 1
+
+
+def _changes(
+    scene: Scene,
+    gaussians: Gaussians,
+    cameras: Camera,
+    cfg: ModelConfig,
+    chances: Float[Array, " N"] | None,
+) -> _Changes:
+    """What the motion field does to every Gaussian."""
+    gate, subset = gaussians.gate, None
+    if gate is not None and cfg.moving_share < 1:
+        scores = gate if chances is None else gate + chances
+        count = math.ceil(cfg.moving_share * len(gate))
+        subset = compaction.highest(jnp.where(scene.alive, scores, -jnp.inf), count)
+    chosen = lambda rows: rows if subset is None else compaction.select(rows, subset, 0)
+    # The same features feed the heads and OCD-Net: Eqs. 1 and 4 name them both f.
+    field = hexplane.features(scene.params.hexplane, chosen(gaussians.means), scene.bounds, cameras.time, cfg)
+    hidden, motion = networks.apply_heads(scene.params.heads, field)
+    changes = _Changes(motion, networks.apply_ocd(scene.params.ocd, hidden) - 1)
+    if gate is not None:
+        factor = jax.nn.sigmoid(chosen(gate))
+        changes = jax.tree.map(lambda rows: factor.reshape(1, -1, *[1] * (rows.ndim - 2)) * rows, changes)
+    return changes if subset is None else jax.tree.map(lambda rows: compaction.expand(rows, subset, 1), changes)
 
 
 def _on_paths(

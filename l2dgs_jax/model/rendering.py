@@ -33,6 +33,7 @@ def render(
     pair_capacity: int | None,
     means2d_probe: Float[Array, "V N 2"] | None = None,
     presence: Float[Array, " N"] | None = None,
+    chances: Float[Array, " N"] | None = None,
 ) -> RenderOutput:
     """Render V views, each at its own instant (Eqs. 1-9).
 
@@ -49,8 +50,9 @@ def render(
         pair_capacity: size of the rasterizer's pair buffer for all views; None only outside jit.
         means2d_probe: zeros whose gradient is dL/d(mean2d) in pixels.
         presence: see `deform`.
+        chances: see `deform`.
     """
-    moved = deform(scene, cameras, cfg, moving=moving, sh_degree_active=sh_degree, presence=presence)
+    moved = deform(scene, cameras, cfg, moving=moving, sh_degree_active=sh_degree, presence=presence, chances=chances)
     drawn = rasterize(
         moved.means,
         moved.quats,

@@ -118,6 +118,7 @@ def objective(
         pair_capacity=pair_capacity,
         means2d_probe=probe,
         presence=presence(state, config),
+        chances=chances(state, config),
     )
     cfg = config.loss
     start, steps = (config.coarse_steps, config.fine_steps) if moving else (0, config.coarse_steps)
@@ -169,6 +170,17 @@ def presence(state: TrainState, config: Config) -> Float[Array, " N"] | None:
     share = config.drop * state.step.astype(state.stats.seen.dtype) / config.steps
     key = jax.random.fold_in(_key(state, config), 3)
     return jnp.where(jax.random.bernoulli(key, share, state.scene.alive.shape), 0, 1 / (1 - share))
+
+
+def chances(state: TrainState, config: Config) -> Float[Array, " N"] | None:
+    """What makes the motion field act on Gaussians at random in this step, in proportion to the odds of their gates.
+
+    Added to logits, Gumbel noise draws without replacement (arXiv 1903.06059): gates that have closed may open again.
+    """
+    if not (config.model.motion_gate and config.model.moving_share < 1):
+        return None
+    key = jax.random.fold_in(_key(state, config), 4)
+    return jax.random.gumbel(key, state.scene.alive.shape, state.stats.seen.dtype)
 
 
 def exposed(

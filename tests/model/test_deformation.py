@@ -211,6 +211,40 @@ def test_the_gate_lets_as_much_of_the_motion_through_as_it_says():
             np.testing.assert_allclose(value, expected, atol=1e-12, err_msg=name)
 
 
+def test_the_motion_field_acts_on_those_whose_gates_are_open_widest():
+    params, cameras = scene(), look()
+    logits, wide = np.array([1.0, -3.0, 2.0, 0.5, -4.0, -1.0]), np.array([0, 2, 3])
+    alive = ALIVE.at[2].set(False)
+    part = dataclasses.replace(CFG, moving_share=0.5)
+    still, free, some, live, other = (
+        moved_at(gated(params, logits), cameras=cameras, moving=moving, cfg=cfg, **options)
+        for moving, cfg, options in (
+            (False, CFG, {}),
+            (True, CFG, {}),
+            (True, part, {}),
+            (True, part, {"alive": alive}),
+            (True, part, {"chances": jnp.where(jnp.arange(N) % 2 == 1, 9.0, 0.0)}),
+        )
+    )
+    odd = np.array([1, 3, 5])
+    for moved, rows in ((some, wide), (live, np.array([0, 3, 5])), (other, odd)):
+        rest = np.setdiff1d(np.arange(N), [*rows, 2])
+        for name in ("means", "quats", "scales", "illumination"):
+            value, there, here = (np.asarray(getattr(x, name)) for x in (moved, free, still))
+            np.testing.assert_allclose(value[:, rows], there[:, rows], atol=1e-12, err_msg=name)
+            np.testing.assert_allclose(value[:, rest], here[:, rest], atol=1e-12, err_msg=name)
+
+
+def test_gradients_of_a_part_that_moves():
+    part = dataclasses.replace(CFG, moving_share=0.5)
+    cameras, logits = look(), np.array([1.0, -3.0, 2.0, 0.5, -4.0, -1.0])
+
+    def f(params):
+        return moved_at(params, cameras=cameras, moving=True, cfg=part)
+
+    check_grads(f, (gated(scene(), logits),), 1, ["rev"], eps=1e-6)
+
+
 def test_motion_is_measured_in_the_unit_of_lengths():
     params, cameras = scene(), look()
     offset = lambda cfg, extent: (
