@@ -57,7 +57,7 @@ def _score(member: dict[str, Any], path: Sequence[str]) -> float | None:
     found: Any = member["scores"]
     for key in path:
         found = found.get(key) if isinstance(found, dict) else None
-    return found
+    return None if found is None else float(found)
 
 
 def _text(value: Any) -> str:
