@@ -80,7 +80,7 @@ class Lpips(NamedTuple):
 
 def lpips_maps(
     network: Network, weights: Lpips, a: Float[Array, "H W 3"], b: Float[Array, "H W 3"]
-) -> list[Float[Array, "h w"]]:
+) -> list[Float[Array, "_ _"]]:
     """The difference that each layer sees, at its own resolution; LPIPS is the sum of their means.
 
     Args:
@@ -99,7 +99,7 @@ def lpips_maps(
     return maps
 
 
-def _convolved(x: Images, layer: Layer, conv: Conv) -> Images:
+def _convolved(x: Images, layer: Layer, conv: Conv) -> Float[Array, "B h w O"]:
     stride, around = (layer.stride,) * 2, [(layer.padding,) * 2] * 2
     order = ("NHWC", "HWIO", "NHWC")
     weight = conv.weight.astype(x.dtype)
@@ -107,7 +107,7 @@ def _convolved(x: Images, layer: Layer, conv: Conv) -> Images:
     return product + _row(conv.bias, x)
 
 
-def _pooled(x: Images, window: int) -> Images:
+def _pooled(x: Images, window: int) -> Float[Array, "B h w C"]:
     return jax.lax.reduce_window(x, -jnp.inf, jax.lax.max, (1, window, window, 1), (1, 2, 2, 1), "VALID")
 
 

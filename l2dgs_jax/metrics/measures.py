@@ -15,7 +15,7 @@ from l2dgs_jax.metrics.multiscale import inside, ms_ssim_maps, pool
 
 Pixels = Float[np.ndarray, "H W C"]
 Mask = Bool[np.ndarray, "H W"]
-Maps = Sequence[Float[np.ndarray, "h w c"]]
+Maps = Sequence[Float[np.ndarray, "_ _ _"]]
 
 
 class Measure(NamedTuple):
@@ -29,7 +29,7 @@ class Measure(NamedTuple):
     """
 
     maps: Callable[[Pixels, Pixels], Maps]
-    score: Callable[[Sequence[Float[np.ndarray, " c"]]], float]
+    score: Callable[[Sequence[Float[np.ndarray, " _"]]], float]
     masked: Callable[[Pixels, Pixels, Mask], float] | None = None
     spread: bool = False
 
@@ -69,7 +69,7 @@ def _ssim(border: Border) -> Callable[[Pixels, Pixels], Maps]:
     return maps
 
 
-def _mean(values: Float[np.ndarray, "h w c"], mask: Mask) -> Float[np.ndarray, " c"]:
+def _mean(values: Float[np.ndarray, "H W C"], mask: Mask) -> Float[np.ndarray, " C"]:
     counted = values[mask & np.isfinite(values[..., 0])]
     return counted.mean(0, np.float64) if len(counted) else np.full(values.shape[2], np.nan)
 
@@ -80,16 +80,16 @@ def _nearest(mask: Mask, shape: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
     return cv2.resize(mask.astype(np.uint8), shape[::-1], interpolation=cv2.INTER_NEAREST).astype(bool)
 
 
-def _decibel(means: Sequence[Float[np.ndarray, " c"]]) -> float:
+def _decibel(means: Sequence[Float[np.ndarray, " _"]]) -> float:
     with np.errstate(divide="ignore"):
         return float(-10 * np.log10(means[0].mean()))
 
 
-def _average(means: Sequence[Float[np.ndarray, " c"]]) -> float:
+def _average(means: Sequence[Float[np.ndarray, " _"]]) -> float:
     return float(means[0].mean())
 
 
-def _total(means: Sequence[Float[np.ndarray, " c"]]) -> float:
+def _total(means: Sequence[Float[np.ndarray, " _"]]) -> float:
     return float(np.sum([mean.mean() for mean in means]))
 
 

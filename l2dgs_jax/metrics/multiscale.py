@@ -13,7 +13,7 @@ SCALE_WEIGHTS = np.array([0.0448, 0.2856, 0.3001, 0.2363, 0.1333])
 Pixels = Float[np.ndarray, "H W C"]
 
 
-def ms_ssim_maps(a: Pixels, b: Pixels) -> list[Float[np.ndarray, "h w C"]]:
+def ms_ssim_maps(a: Pixels, b: Pixels) -> list[Float[np.ndarray, "_ _ C"]]:
     """What each scale contributes around each of its pixels: contrast and structure, the last scale also luminance.
 
     Every scale has half the rows and columns of the one before. Windows are those of `ssim`. Where they leave the image

@@ -7,6 +7,7 @@ import subprocess
 import sys
 
 import finished_run
+import networks
 import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
@@ -17,6 +18,9 @@ from l2dgs_jax.cameras.geometry import select_camera
 from l2dgs_jax.data import load_dataset
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.evaluate import evaluate, main, table
+from l2dgs_jax.metrics.flip import flip_map
+from l2dgs_jax.metrics.lpips import SMALLEST
+from l2dgs_jax.runs.lpips_weights import load_lpips
 from l2dgs_jax.runtime import command_line
 
 
@@ -135,6 +139,30 @@ def test_welllit_scores_are_scikit_images(result, rendered):
     assert result["welllit"]["overall"]["psnr_gain"] >= result["welllit"]["overall"]["psnr"] - 0.1
 
 
+def test_scores_beyond_these_are_there_or_null(result, rendered):
+    overall = result["welllit"]["overall"]
+    found = np.mean([flip_map(p, t).mean() for p, t in zip(rendered["welllit"], rendered["truth"], strict=True)])
+    np.testing.assert_allclose(overall["flip"], found, atol=1e-3)
+    assert overall["ssim_3dgs"] != overall["ssim"]
+    for name in ("ms_ssim", "lpips_alex", "lpips_vgg"):  # the images are small, and there are no weights
+        assert overall[name] is overall[f"{name}_gain"] is None
+    assert "LPIPS needs weights" in table(result)
+
+
+def test_lpips_in_the_papers_convention_is_shared_out_by_area(run, monkeypatch, tmp_path):
+    monkeypatch.setitem(metrics.NETWORKS, "alex", networks.TINY)
+    monkeypatch.setitem(SMALLEST, "alex", 1)
+    np.savez(tmp_path / "tiny.npz", **networks.state_dict("alex"))
+    weights = load_lpips("alex", [tmp_path / "tiny.npz"])
+    found = evaluate(run, lpips={"alex": weights}, convention="paper")
+    assert found["region_convention"] == "paper"
+    frames = {region: scores["lpips_alex_gain"] for region, scores in found["welllit"].items()}
+    assert frames["overall"] > 0
+    np.testing.assert_allclose(frames["static"] / frames["overall"], found["welllit"]["static"]["area"], rtol=0.05)
+    assert f"LPIPS (AlexNet) {frames['overall']:.3f}" in table(found)
+    assert "LPIPS needs weights" not in table(found)
+
+
 def test_dark_frame_times_its_best_gain(result, rendered):
     gain = best_gain(rendered["input"], rendered["truth"])
     assert gain > 3
@@ -223,6 +251,10 @@ def test_a_process_of_its_own_in_single_precision_finds_the_same(base, result, t
             "scores.json: cannot be written; expected a file in an existing",
         ),
         (["{run}", "--json", "{empty}"], "empty: cannot be written; expected a file in an existing folder"),
+        (
+            ["{run}", "--lpips-alex", "{missing}.npz"],
+            "missing.npz: cannot be read (No such file or directory); expected",
+        ),
     ],
 )
 def test_bad_input_is_one_sentence_and_exit_code_2(base, tmp_path, capsys, arguments, message):
@@ -256,7 +288,8 @@ def test_pixels_that_do_not_count_are_left_out_and_covisible_ones_scored(run, re
             split, images=spoil(split.images), welllit=spoil(split.welllit), valid=valid, covisible=seen
         )
         results.append(evaluate(dataclasses.replace(run, dataset=dataclasses.replace(run.dataset, test=test))))
-    assert results[0] == results[1]
+    flowless = [{key: scores for key, scores in found.items() if key != "temporal"} for found in results]
+    assert flowless[0] == flowless[1]  # flow looks at all pixels
     found = results[0]
     assert found["lowlight_regions"].keys() == {"dynamic", "static", "covisible"}
     assert found["welllit"].keys() == {"overall", "dynamic", "static", "covisible"}
