@@ -15,6 +15,8 @@ WINDOW = np.exp(-0.5 * (np.arange(-RADIUS, RADIUS + 1) / SIGMA) ** 2)
 WINDOW /= WINDOW.sum()
 C1, C2 = 0.01**2, 0.03**2  # for values in [0, 1]
 
+NO_VALUE = -np.inf  # in maps of local values; NaN is left for what went wrong
+
 Border = Literal["zero", "mirror"]
 
 
@@ -51,6 +53,13 @@ def ssim(a: Float[Array, "*B H W C"], b: Float[Array, "*B H W C"]) -> Float[Arra
     if min(height, width) > 2 * RADIUS:
         similarity = similarity[..., RADIUS:-RADIUS, RADIUS:-RADIUS, :]
     return similarity.mean((-3, -2, -1))
+
+
+def inside(windows: Float[np.ndarray, "H W C"]) -> Float[np.ndarray, "H W C"]:
+    """A copy of what windows around the pixels yield, without value where they leave the image."""
+    kept = np.full_like(windows, NO_VALUE)
+    kept[RADIUS:-RADIUS, RADIUS:-RADIUS] = windows[RADIUS:-RADIUS, RADIUS:-RADIUS]
+    return kept
 
 
 def partial_ssim(a: Float[Array, "H W C"], b: Float[Array, "H W C"], mask: Bool[Array, "H W"]) -> Float[Array, ""]:

@@ -10,8 +10,8 @@ from jaxtyping import Bool, Float
 
 from l2dgs_jax.metrics import lpips
 from l2dgs_jax.metrics.flip import flip_map
-from l2dgs_jax.metrics.images import RADIUS, Border, partial_ssim, ssim_map
-from l2dgs_jax.metrics.multiscale import inside, ms_ssim_maps, pool
+from l2dgs_jax.metrics.images import NO_VALUE, RADIUS, Border, inside, partial_ssim, ssim_map
+from l2dgs_jax.metrics.multiscale import ms_ssim_maps, pool
 
 Pixels = Float[np.ndarray, "H W C"]
 Mask = Bool[np.ndarray, "H W"]
@@ -22,10 +22,10 @@ class Measure(NamedTuple):
     """A score made of means of local values.
 
     Attributes:
-        maps: local values of a prediction and the truth, at one resolution or more, NaN where there are none.
+        maps: local values of a prediction and the truth, at one resolution or more, or `NO_VALUE`.
         score: what the means of the maps, one number a channel, amount to.
         masked: how a mask is scored from images that show nothing else, if not as `Measure.maps` of such images.
-        spread: whether tables in the literature give for a region the whole frame's score times the region's area.
+        spread: whether the convention "paper" gives a region the whole frame's score times its area.
     """
 
     maps: Callable[[Pixels, Pixels], Maps]
@@ -47,7 +47,7 @@ def lpips_measure(network: lpips.Network, weights: lpips.Lpips | None) -> Measur
 
     def maps(a: Pixels, b: Pixels) -> Maps:
         if weights is None or min(a.shape[:2]) < lpips.SMALLEST[network]:
-            return [np.full((1, 1, 1), np.nan)]
+            return [np.full((1, 1, 1), NO_VALUE)]
         return [np.asarray(x)[..., None] for x in _lpips_maps(network, weights, a, b)]
 
     def masked(a: Pixels, b: Pixels, mask: Mask) -> float:
@@ -70,7 +70,7 @@ def _ssim(border: Border) -> Callable[[Pixels, Pixels], Maps]:
 
 
 def _mean(values: Float[np.ndarray, "H W C"], mask: Mask) -> Float[np.ndarray, " C"]:
-    counted = values[mask & np.isfinite(values[..., 0])]
+    counted = values[mask & (values[..., 0] != NO_VALUE)]
     return counted.mean(0, np.float64) if len(counted) else np.full(values.shape[2], np.nan)
 
 
@@ -85,10 +85,6 @@ def _decibel(means: Sequence[Float[np.ndarray, " _"]]) -> float:
         return float(-10 * np.log10(means[0].mean()))
 
 
-def _average(means: Sequence[Float[np.ndarray, " _"]]) -> float:
-    return float(means[0].mean())
-
-
 def _total(means: Sequence[Float[np.ndarray, " _"]]) -> float:
     return float(np.sum([mean.mean() for mean in means]))
 
@@ -96,7 +92,7 @@ def _total(means: Sequence[Float[np.ndarray, " _"]]) -> float:
 _partial_ssim, _lpips_maps = jax.jit(partial_ssim), jax.jit(lpips.lpips_maps, static_argnums=0)
 
 PSNR = Measure(lambda a, b: [(a - b) ** 2], _decibel)
-SSIM = Measure(_ssim("mirror"), _average, lambda a, b, mask: float(_partial_ssim(a, b, mask)))
-SSIM_3DGS = Measure(_ssim("zero"), _average)
+SSIM = Measure(_ssim("mirror"), _total, lambda a, b, mask: float(_partial_ssim(a, b, mask)))
+SSIM_3DGS = Measure(_ssim("zero"), _total)
 MS_SSIM = Measure(ms_ssim_maps, pool)
-FLIP = Measure(lambda a, b: [flip_map(a, b)[..., None]], _average)
+FLIP = Measure(lambda a, b: [flip_map(a, b)[..., None]], _total)

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from l2dgs_jax.metrics.images import C1, C2, RADIUS, WINDOW
+from l2dgs_jax.metrics.images import C1, C2, NO_VALUE, RADIUS, WINDOW, inside
 
 SCALE_WEIGHTS = np.array([0.0448, 0.2856, 0.3001, 0.2363, 0.1333])
 
@@ -17,10 +17,10 @@ def ms_ssim_maps(a: Pixels, b: Pixels) -> list[Float[np.ndarray, "_ _ C"]]:
     """What each scale contributes around each of its pixels: contrast and structure, the last scale also luminance.
 
     Every scale has half the rows and columns of the one before. Windows are those of `ssim`. Where they leave the image
-    the maps are NaN, and everywhere if the last scale has no window inside: in images of less than 161 pixels a side.
+    the maps have no value, nor anywhere if the last scale has no window inside: in images of less than 161 pixels a side.
     """
     if min(a.shape[:2]) <= 2 * RADIUS * 2 ** (len(SCALE_WEIGHTS) - 1):
-        return [np.full_like(a, np.nan)] * len(SCALE_WEIGHTS)
+        return [np.full_like(a, NO_VALUE)] * len(SCALE_WEIGHTS)
     maps = []
     for scale in range(len(SCALE_WEIGHTS)):
         if scale:
@@ -39,15 +39,7 @@ def pool(means: Sequence[Float[np.ndarray, " C"]]) -> float:
 
 
 def _window_means(image: Pixels) -> Pixels:
-    means = cv2.sepFilter2D(image, -1, WINDOW, WINDOW).reshape(image.shape)
-    return inside(means)
-
-
-def inside(windows: Pixels) -> Pixels:
-    """A copy that is NaN where windows leave the image."""
-    kept = np.full_like(windows, np.nan)
-    kept[RADIUS:-RADIUS, RADIUS:-RADIUS] = windows[RADIUS:-RADIUS, RADIUS:-RADIUS]
-    return kept
+    return inside(cv2.sepFilter2D(image, -1, WINDOW, WINDOW).reshape(image.shape))
 
 
 def _halved(image: Pixels) -> Float[np.ndarray, "h w C"]:

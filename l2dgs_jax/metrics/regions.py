@@ -38,7 +38,7 @@ def compare(
         convention: how "dynamic" and "static" are scored: "nsff", the mean of the whole frame's local values over the
             region (arXiv 2011.13084); "masked", after all but the region was made black in both images, SSIM from its
             pixels alone (DyCheck, arXiv 2210.13445); "paper", as "nsff" but for LPIPS, which is the whole frame's times
-            the region's part of it, as the L2DGS paper's table must have been made.
+            the region's part of it, as the figures of the L2DGS paper are.
 
     Returns:
         The scores of "overall", given `dynamic` of "dynamic" and "static", and given `covisible` of "covisible", always
@@ -52,12 +52,11 @@ def compare(
 
     def score(name: str, region: str) -> float:
         measure, mask = measures[name], masks[region]
-        parted = region in ("dynamic", "static")
-        if parted and convention == "paper" and measure.spread:
+        of_motion = region in ("dynamic", "static")
+        if of_motion and convention == "paper" and measure.spread:
             return score(name, "overall") * mask.sum() / masks["overall"].sum()
-        if convention == "masked" if parted else not (region == "overall" and mask.all()):
-            return _masked_score(measure, prediction, truth, mask)
-        return mean_score(whole[name], measure, mask)
+        alone = convention == "masked" if of_motion else not (region == "overall" and mask.all())
+        return _score_alone(measure, prediction, truth, mask) if alone else mean_score(whole[name], measure, mask)
 
     return {
         region: {name: _known(score(name, region)) for name in measures} | {"area": float(mask.mean())}
@@ -89,7 +88,7 @@ def summarise(frames: Sequence[Mapping[str, Score]]) -> dict[str, Score]:
     return summary
 
 
-def _masked_score(
+def _score_alone(
     measure: Measure, prediction: Float[np.ndarray, "H W C"], truth: Float[np.ndarray, "H W C"], mask: np.ndarray
 ) -> float:
     if measure.masked:

@@ -33,7 +33,7 @@ def table(result: dict) -> str:
     else:
         lines.append(f"gain {result['gain']:.3f}, of the dark frame {result['dark_frame_gain']['gain']:.3f}")
         lines += _after_gain(result["welllit"]["overall"])
-    lines += [f"warping error {_warping(scores)}" for scores in result["temporal"]["regions"].values()][:1]
+    lines += _warping(result["temporal"]["regions"].get("overall", {}))
     return "\n".join(lines)
 
 
@@ -55,7 +55,10 @@ def _after_gain(scores: dict) -> list[str]:
     return lines
 
 
-def _warping(scores: dict) -> str:
+def _warping(scores: dict) -> list[str]:
+    if scores.get("warping_error") is None:
+        return []
     if "warping_error_gain" not in scores:
-        return f"{scores['warping_error']:.5f}"
-    return f"{scores['warping_error_gain']:.5f} after the gain, {scores['warping_error_truth']:.5f} of the truth"
+        return [f"warping error {scores['warping_error']:.5f}"]
+    gained, truth = scores["warping_error_gain"], scores["warping_error_truth"]
+    return [f"warping error after the gain {gained:.5f}, of the truth {truth:.5f}"]

@@ -118,6 +118,17 @@ def test_what_images_are_too_small_for_is_unknown():
     assert metrics.summarise([scores])["dynamic"]["psnr"] == scores["dynamic"]["psnr"]
 
 
+def test_a_pixel_that_is_no_number_leaves_none_of_the_whole():
+    a, b = pair(13, 20, 24)
+    a[10, 12] = np.nan
+    mask = np.zeros((20, 24), bool)
+    mask[:, :4] = True
+    measures = metrics.BASIC | {"ssim_3dgs": SSIM_3DGS, "flip": FLIP}
+    scores = metrics.compare(a, b, mask, measures=measures)
+    assert all(scores["overall"][name] is None for name in measures)
+    assert scores["dynamic"]["psnr"] == pytest.approx(-10 * np.log10(((a - b)[:, :4] ** 2).mean()))
+
+
 # A measure of which all conventions are easily told: the mean difference, halved twice in size.
 COARSE = Measure(
     lambda a, b: [np.abs(a - b).reshape(a.shape[0] // 4, 4, a.shape[1] // 4, 4, 3).mean((1, 3))],
