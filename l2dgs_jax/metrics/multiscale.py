@@ -17,7 +17,7 @@ def ms_ssim_maps(a: Pixels, b: Pixels) -> list[Float[np.ndarray, "_ _ C"]]:
     """What each scale contributes around each of its pixels: contrast and structure, the last scale also luminance.
 
     Every scale has half the rows and columns of the one before. Windows are those of `ssim`. Where they leave the image
-    the maps have no value, nor anywhere if the last scale has no window inside: in images of less than 161 pixels a side.
+    the maps have no value, nor anywhere if the last scale has no window inside, below 161 pixels a side.
     """
     if min(a.shape[:2]) <= 2 * RADIUS * 2 ** (len(SCALE_WEIGHTS) - 1):
         return [np.full_like(a, NO_VALUE)] * len(SCALE_WEIGHTS)
@@ -29,7 +29,7 @@ def ms_ssim_maps(a: Pixels, b: Pixels) -> list[Float[np.ndarray, "_ _ C"]]:
         similarity = (2 * (product - mean_a * mean_b) + C2) / (square - mean_a**2 - mean_b**2 + C2)
         if scale == len(SCALE_WEIGHTS) - 1:
             similarity *= (2 * mean_a * mean_b + C1) / (mean_a**2 + mean_b**2 + C1)
-        maps.append(similarity)
+        maps.append(inside(similarity))
     return maps
 
 
@@ -39,7 +39,7 @@ def pool(means: Sequence[Float[np.ndarray, " C"]]) -> float:
 
 
 def _window_means(image: Pixels) -> Pixels:
-    return inside(cv2.sepFilter2D(image, -1, WINDOW, WINDOW).reshape(image.shape))
+    return cv2.sepFilter2D(image, -1, WINDOW, WINDOW).reshape(image.shape)
 
 
 def _halved(image: Pixels) -> Float[np.ndarray, "h w C"]:
