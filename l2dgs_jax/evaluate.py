@@ -8,27 +8,39 @@ from typing import Literal
 import tyro
 
 from l2dgs_jax.errors import UserError
+from l2dgs_jax.metrics import Convention, Lpips, Network
 from l2dgs_jax.runs import open_run
-from l2dgs_jax.runs.scores import evaluate, table
+from l2dgs_jax.runs.lpips_weights import load_lpips
+from l2dgs_jax.runs.score_table import table
+from l2dgs_jax.runs.scores import evaluate
 from l2dgs_jax.runtime import command_line
 from l2dgs_jax.runtime.files import write_json
 
 
 @dataclass(frozen=True)
 class Evaluate:
-    """Score every view of a split.
+    """Score every view of a split: PSNR, SSIM, MS-SSIM, FLIP, LPIPS if it has weights, and steadiness in time.
+
+    The table shows the most usual scores; --json FILE keeps all of them. docs/metrics.md defines them.
 
     Attributes:
         run: folder of the run.
         split: which views.
         json: file to write the scores to.
         stage: the last checkpoint, or the one at the end of the coarse stage.
+        region_convention: how the dynamic and the static region are scored: by the whole frame's local values there
+            (nsff), with all else blackened (masked), or LPIPS as the whole frame's times the region's area (paper).
+        lpips_alex: files with AlexNet and the heads of LPIPS for it, as .npz or as PyTorch saved them.
+        lpips_vgg: the same for VGG16.
     """
 
     run: tyro.conf.Positional[Path]
     split: Literal["test", "train"] = "test"
     json: Path | None = None
     stage: Literal["final", "coarse"] = "final"
+    region_convention: Convention = "nsff"
+    lpips_alex: tuple[Path, ...] = ()
+    lpips_vgg: tuple[Path, ...] = ()
 
 
 def main(arguments: Sequence[str]) -> None:
@@ -36,7 +48,10 @@ def main(arguments: Sequence[str]) -> None:
     options = command_line.parse(Evaluate, arguments, "evaluate")
     if options.json and (options.json.is_dir() or not options.json.parent.is_dir()):
         raise UserError(f"--json {options.json}: cannot be written; expected a file in an existing folder")
-    result = evaluate(open_run(options.run, options.stage), options.split)
+    files: dict[Network, tuple[Path, ...]] = {"alex": options.lpips_alex, "vgg": options.lpips_vgg}
+    lpips: dict[Network, Lpips] = {network: load_lpips(network, paths) for network, paths in files.items() if paths}
+    run = open_run(options.run, options.stage)
+    result = evaluate(run, options.split, lpips=lpips, convention=options.region_convention)
     print(table(result))
     if options.json:
         write_json(options.json, result)

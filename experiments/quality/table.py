@@ -55,7 +55,7 @@ def collect(studies: Sequence[Path]) -> dict[Row, dict[str, dict[str, list[float
 def _score(scores: Any, path: Sequence[str]) -> float | None:
     for key in path:
         scores = scores.get(key) if isinstance(scores, dict) else None
-    return scores
+    return None if scores is None else float(scores)
 
 
 def markdown(found: dict[Row, dict[str, dict[str, list[float]]]]) -> str:

@@ -1,17 +1,33 @@
-"""Image quality: PSNR and SSIM, whole and by region, and what is left of an error after the best gain."""
+"""Image quality: how alike images are, whole and by region, and what is left of an error after the best gain."""
 
 from l2dgs_jax.metrics.gain import best_gain
-from l2dgs_jax.metrics.images import masked_ssim, partial_ssim, psnr, ssim, ssim_map
-from l2dgs_jax.metrics.regions import RegionScore, compare, summarise
+from l2dgs_jax.metrics.images import partial_ssim, psnr, ssim, ssim_map
+from l2dgs_jax.metrics.lpips import NETWORKS, Lpips, Network
+from l2dgs_jax.metrics.measures import FLIP, MS_SSIM, PSNR, SSIM, SSIM_3DGS, Measure, lpips_measure
+from l2dgs_jax.metrics.regions import BASIC, Convention, Score, compare, region_masks, summarise
+from l2dgs_jax.metrics.warping import warping_error_map
 
 __all__ = [
-    "RegionScore",
+    "BASIC",
+    "FLIP",
+    "MS_SSIM",
+    "NETWORKS",
+    "PSNR",
+    "SSIM",
+    "SSIM_3DGS",
+    "Convention",
+    "Lpips",
+    "Measure",
+    "Network",
+    "Score",
     "best_gain",
     "compare",
-    "masked_ssim",
+    "lpips_measure",
     "partial_ssim",
     "psnr",
+    "region_masks",
     "ssim",
     "ssim_map",
     "summarise",
+    "warping_error_map",
 ]

@@ -15,9 +15,9 @@ WINDOW = np.exp(-0.5 * (np.arange(-RADIUS, RADIUS + 1) / SIGMA) ** 2)
 WINDOW /= WINDOW.sum()
 C1, C2 = 0.01**2, 0.03**2  # for values in [0, 1]
 
+NO_VALUE = -np.inf  # in maps of local values; NaN is left for what went wrong
+
 Border = Literal["zero", "mirror"]
-Image = Float[Array, "H W C"] | Float[np.ndarray, "H W C"]
-Mask = Bool[Array, "H W"] | Bool[np.ndarray, "H W"]
 
 
 def ssim_map(
@@ -55,11 +55,11 @@ def ssim(a: Float[Array, "*B H W C"], b: Float[Array, "*B H W C"]) -> Float[Arra
     return similarity.mean((-3, -2, -1))
 
 
-def masked_ssim(
-    a: Float[Array, "*B H W C"], b: Float[Array, "*B H W C"], mask: Bool[Array, "*B H W"]
-) -> Float[Array, "*B"]:
-    """Mean of the SSIM map over a mask, as NSFF (arXiv 2011.13084); NaN where the mask is empty."""
-    return _masked_mean(ssim_map(a, b, "mirror"), mask)
+def inside(windows: Float[np.ndarray, "H W C"]) -> Float[np.ndarray, "H W C"]:
+    """A copy of what windows around the pixels yield, without value where they leave the image."""
+    kept = np.full_like(windows, NO_VALUE)
+    kept[RADIUS:-RADIUS, RADIUS:-RADIUS] = windows[RADIUS:-RADIUS, RADIUS:-RADIUS]
+    return kept
 
 
 def partial_ssim(a: Float[Array, "H W C"], b: Float[Array, "H W C"], mask: Bool[Array, "H W"]) -> Float[Array, ""]:
@@ -67,10 +67,10 @@ def partial_ssim(a: Float[Array, "H W C"], b: Float[Array, "H W C"], mask: Bool[
 
     Source: arXiv 2210.13445 and its code. Sums along a window's side are scaled by its length over the number of pixels
     that it sees, whatever their weights; windows that see nothing count as equal. For an image without a window inside,
-    `masked_ssim`.
+    the mean of its SSIM map over the mask.
     """
     if min(a.shape[:2]) <= 2 * RADIUS:
-        return masked_ssim(a, b, mask)
+        return _masked_mean(ssim_map(a, b, "mirror"), mask)
 
     def shifted(x: Float[Array, "..."], axis: int) -> list[Float[Array, "..."]]:
         length = x.shape[axis] - 2 * RADIUS

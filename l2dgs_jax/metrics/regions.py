@@ -1,24 +1,19 @@
 """How the regions of a frame compare with the truth."""
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Literal
 
-import jax
 import numpy as np
+from jaxtyping import Array, Bool, Float
 
-from l2dgs_jax.metrics.images import Image, Mask, masked_ssim, partial_ssim, psnr, ssim
+from l2dgs_jax.metrics.measures import PSNR, SSIM, Measure, mean_score
 
+Image = Float[Array, "H W C"] | Float[np.ndarray, "H W C"]
+Mask = Bool[Array, "H W"] | Bool[np.ndarray, "H W"]
+Score = dict[str, float | None]
 
-class RegionScore(NamedTuple):
-    """How one region of one frame compares with the truth.
-
-    Attributes:
-        psnr: dB.
-        ssim: mean of the SSIM map (of the windows inside the image for the whole frame).
-    """
-
-    psnr: float
-    ssim: float
+Convention = Literal["nsff", "masked", "paper"]
+BASIC = {"psnr": PSNR, "ssim": SSIM}
 
 
 def compare(
@@ -27,7 +22,10 @@ def compare(
     dynamic: Mask | None = None,
     valid: Mask | None = None,
     covisible: Mask | None = None,
-) -> dict[str, RegionScore]:
+    *,
+    measures: Mapping[str, Measure] = BASIC,
+    convention: Convention = "nsff",
+) -> dict[str, Score]:
     """Score one frame, values in [0, 1].
 
     Args:
@@ -36,42 +34,68 @@ def compare(
         dynamic: which pixels show something that moves.
         valid: which pixels count; None for all. "overall" is then scored as "covisible" is.
         covisible: which pixels enough training views have seen.
+        measures: what to score, by name.
+        convention: how "dynamic" and "static" are scored: "nsff", the mean of the whole frame's local values over the
+            region (arXiv 2011.13084); "masked", after all but the region was made black in both images, SSIM from its
+            pixels alone (DyCheck, arXiv 2210.13445); "paper", as "nsff" but for LPIPS, which is the whole frame's times
+            the region's part of it, as the figures of the L2DGS paper are.
 
     Returns:
-        The score of "overall", given `dynamic` of "dynamic" and "static", and given `covisible` of "covisible" as
-        DyCheck does (mPSNR, mSSIM), those of them that have any pixel.
+        The scores of "overall", given `dynamic` of "dynamic" and "static", and given `covisible` of "covisible", always
+        "masked", those of them that have any pixel. None is a score that cannot be had of so few pixels; "area" is the
+        region's part of the frame.
     """
     prediction, truth = np.asarray(prediction), np.asarray(truth, prediction.dtype)
-    counted = np.ones(prediction.shape[:2], bool) if valid is None else np.asarray(valid)
-    truth = np.where(counted[..., None], truth, prediction)
+    masks = region_masks(prediction.shape[:2], dynamic, valid, covisible)
+    truth = np.where(masks["overall"][..., None], truth, prediction)
+    whole = {name: measure.maps(prediction, truth) for name, measure in measures.items()}
+
+    def score(name: str, region: str) -> float:
+        measure, mask = measures[name], masks[region]
+        of_motion = region in ("dynamic", "static")
+        if of_motion and convention == "paper" and measure.spread:
+            return score(name, "overall") * mask.sum() / masks["overall"].sum()
+        alone = convention == "masked" if of_motion else not (region == "overall" and mask.all())
+        return _score_alone(measure, prediction, truth, mask) if alone else mean_score(whole[name], measure, mask)
+
+    return {
+        region: {name: _known(score(name, region)) for name in measures} | {"area": float(mask.mean())}
+        for region, mask in masks.items()
+        if mask.any()
+    }
+
+
+def region_masks(
+    shape: tuple[int, int], dynamic: Mask | None, valid: Mask | None, covisible: Mask | None
+) -> dict[str, Bool[np.ndarray, "H W"]]:
+    """The pixels of the regions that `compare` scores; it has the arguments."""
+    counted = np.ones(shape, bool) if valid is None else np.asarray(valid)
     masks = {"overall": counted}
     if dynamic is not None:
         masks |= {"dynamic": counted & np.asarray(dynamic), "static": counted & ~np.asarray(dynamic)}
     if covisible is not None:
         masks["covisible"] = counted & np.asarray(covisible)
-    scores = {}
-    for region, mask in masks.items():
-        if not mask.any():
-            continue
-        if region == "overall" and valid is None:
-            similarity = _ssim(prediction, truth)
-        else:
-            measure = _masked_ssim if region in ("dynamic", "static") else _partial_ssim
-            similarity = measure(prediction, truth, mask)
-        scores[region] = RegionScore(float(_psnr(prediction, truth, mask)), float(similarity))
-    return scores
+    return masks
 
 
-def summarise(frames: Sequence[dict[str, RegionScore]]) -> dict[str, dict[str, float]]:
-    """Means of "psnr" (dB) and "ssim" per region, each over the frames that `compare` scored the region in."""
-    regions = dict.fromkeys(region for frame in frames for region in frame)
-    return {
-        region: {
-            key: float(np.mean([getattr(frame[region], key) for frame in frames if region in frame]))
-            for key in ("psnr", "ssim")
-        }
-        for region in regions
-    }
+def summarise(frames: Sequence[Mapping[str, Score]]) -> dict[str, Score]:
+    """Means per region and score, each over the frames that have it; None if no frame has."""
+    summary: dict[str, Score] = {}
+    for region in dict.fromkeys(region for frame in frames for region in frame):
+        scored = [frame[region] for frame in frames if region in frame]
+        known = {key: [value for score in scored if (value := score[key]) is not None] for key in scored[0]}
+        summary[region] = {key: float(np.mean(values)) if values else None for key, values in known.items()}
+    return summary
 
 
-_ssim, _masked_ssim, _partial_ssim, _psnr = jax.jit(ssim), jax.jit(masked_ssim), jax.jit(partial_ssim), jax.jit(psnr)
+def _score_alone(
+    measure: Measure, prediction: Float[np.ndarray, "H W C"], truth: Float[np.ndarray, "H W C"], mask: np.ndarray
+) -> float:
+    if measure.masked:
+        return measure.masked(prediction, truth, mask)
+    seen = mask[..., None]
+    return mean_score(measure.maps(prediction * seen, truth * seen), measure, mask)
+
+
+def _known(score: float) -> float | None:
+    return None if np.isnan(score) else score

@@ -3,6 +3,7 @@
 import contextlib
 import errno
 import json
+import math
 import os
 import tempfile
 from collections.abc import Iterator
@@ -103,13 +104,26 @@ def new_folder(path: Path) -> Iterator[Path]:
 def write_json(path: Path, content: Any) -> None:
     """Write what JSON can hold, whole or not at all, making the folder that it goes to.
 
+    Numbers that JSON lacks become the strings "Infinity", "-Infinity" and "NaN", as in the JSON of Protocol Buffers;
+    Python's `float` reads them.
+
     Raises:
         UserError: the folder cannot be made, or else as `replacing`.
     """
     make_folder(path.parent)
     with replacing(path) as temporary:
-        temporary.write_text(json.dumps(content, indent=2) + "\n")
+        temporary.write_text(json.dumps(_spelled_out(content), indent=2, allow_nan=False) + "\n")
         flush(temporary)
+
+
+def _spelled_out(content: Any) -> Any:
+    if isinstance(content, dict):
+        return {key: _spelled_out(value) for key, value in content.items()}
+    if isinstance(content, list | tuple):
+        return [_spelled_out(value) for value in content]
+    if isinstance(content, float) and not math.isfinite(content):
+        return json.dumps(content)  # these names, which are JavaScript's
+    return content
 
 
 def is_taken(path: Path) -> bool:

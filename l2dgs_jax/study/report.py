@@ -1,6 +1,7 @@
 """What came out of a study: one table of all members, as JSON, as Markdown and as plots."""
 
 import json
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -57,7 +58,7 @@ def _score(member: dict[str, Any], path: Sequence[str]) -> float | None:
     found: Any = member["scores"]
     for key in path:
         found = found.get(key) if isinstance(found, dict) else None
-    return found
+    return None if found is None else float(found)
 
 
 def _text(value: Any) -> str:
@@ -77,7 +78,8 @@ def _plot(path: Path, members: Sequence[dict[str, Any]], folder: Path) -> None:
     over_time.legend(fontsize=6)
     shown = [name for name, path in _SCORES.items() if path[-1].startswith("psnr")]
     for offset, name in enumerate(shown):
-        values = [_score(member, _SCORES[name]) or 0 for member in members]
+        found = [_score(member, _SCORES[name]) for member in members]
+        values = [score if score is not None and math.isfinite(score) else 0 for score in found]
         places = [index + 0.8 * offset / len(shown) for index in range(len(members))]
         ends.barh(places, values, height=0.8 / len(shown), label=name)
     ends.set(xlabel="held-out views, dB", yticks=range(len(members)))

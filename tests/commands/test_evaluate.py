@@ -7,6 +7,7 @@ import subprocess
 import sys
 
 import finished_run
+import networks
 import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
@@ -17,6 +18,9 @@ from l2dgs_jax.cameras.geometry import select_camera
 from l2dgs_jax.data import load_dataset
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.evaluate import evaluate, main, table
+from l2dgs_jax.metrics.flip import flip_map
+from l2dgs_jax.metrics.lpips import SMALLEST
+from l2dgs_jax.runs.lpips_weights import load_lpips
 from l2dgs_jax.runtime import command_line
 
 
@@ -61,16 +65,16 @@ def psnr(prediction, truth, masks=None):
 
 
 def ssim(prediction, truth, masks=None):
-    """Of windows inside the image, or of all windows around the pixels of a mask."""
-    scores = []
+    """Of windows inside the image, or of those of them around the pixels of a mask."""
+    scores, inside = [], (slice(5, -5), slice(5, -5))
     for i, (p, t) in enumerate(zip(prediction, truth, strict=True)):
         mean, similarity = structural_similarity(
             p, t, gaussian_weights=True, use_sample_covariance=False, channel_axis=-1, data_range=1.0, full=True
         )
         if masks is None:
             scores.append(mean)
-        elif masks[i].any():
-            scores.append(similarity[masks[i]].mean())
+        elif masks[i][inside].any():
+            scores.append(similarity[inside][masks[i][inside]].mean())
     return np.mean(scores)
 
 
@@ -100,9 +104,11 @@ def test_frames_in_a_file_score_the_same(run, result):
 def test_lowlight_scores_are_scikit_images(result, rendered):
     for region, masks in regions(rendered["masks"]).items():
         scores = result["lowlight"] if region == "overall" else result["lowlight_regions"][region]
-        assert set(scores) == {"psnr", "ssim"}
+        assert set(scores) == {"psnr", "ssim", "area"}
         np.testing.assert_allclose(scores["psnr"], psnr(rendered["lowlight"], rendered["input"], masks), atol=1e-3)
         np.testing.assert_allclose(scores["ssim"], ssim(rendered["lowlight"], rendered["input"], masks), atol=1e-3)
+        shown = [1.0] if masks is None else [mask.mean() for mask in masks if mask.any()]
+        np.testing.assert_allclose(scores["area"], np.mean(shown))
     np.testing.assert_allclose(result["mask_area"], rendered["masks"].mean())
 
 
@@ -131,6 +137,30 @@ def test_welllit_scores_are_scikit_images(result, rendered):
             np.testing.assert_allclose(scores["psnr"], psnr(prediction, rendered["truth"], masks), atol=1e-2)
             np.testing.assert_allclose(scores["ssim"], ssim(prediction, rendered["truth"], masks), atol=1e-3)
     assert result["welllit"]["overall"]["psnr_gain"] >= result["welllit"]["overall"]["psnr"] - 0.1
+
+
+def test_scores_beyond_these_are_there_or_null(result, rendered):
+    overall = result["welllit"]["overall"]
+    found = np.mean([flip_map(p, t).mean() for p, t in zip(rendered["welllit"], rendered["truth"], strict=True)])
+    np.testing.assert_allclose(overall["flip"], found, atol=1e-3)
+    assert overall["ssim_3dgs"] != overall["ssim"]
+    for name in ("ms_ssim", "lpips_alex", "lpips_vgg"):  # the images are small, and there are no weights
+        assert overall[name] is overall[f"{name}_gain"] is None
+    assert "LPIPS needs weights" in table(result)
+
+
+def test_lpips_in_the_papers_convention_is_shared_out_by_area(run, monkeypatch, tmp_path):
+    monkeypatch.setitem(metrics.NETWORKS, "alex", networks.TINY)
+    monkeypatch.setitem(SMALLEST, "alex", 1)
+    np.savez(tmp_path / "tiny.npz", **networks.state_dict("alex"))
+    weights = load_lpips("alex", [tmp_path / "tiny.npz"])
+    found = evaluate(run, lpips={"alex": weights}, convention="paper")
+    assert found["region_convention"] == "paper"
+    frames = {region: scores["lpips_alex_gain"] for region, scores in found["welllit"].items()}
+    assert frames["overall"] > 0
+    np.testing.assert_allclose(frames["static"] / frames["overall"], found["welllit"]["static"]["area"], rtol=0.05)
+    assert f"LPIPS (AlexNet) {frames['overall']:.3f}" in table(found)
+    assert "LPIPS needs weights" not in table(found)
 
 
 def test_dark_frame_times_its_best_gain(result, rendered):
@@ -169,6 +199,7 @@ def test_table_shows_every_score(result):
         f"{scores['ssim']:.3f}",
         f"{scores['psnr_gain']:.2f}",
         f"{scores['ssim_gain']:.3f}",
+        "100.0%",
     ]
     dark = next(line for line in lines if line.startswith("dark frame"))
     header = lines[1]
@@ -220,6 +251,10 @@ def test_a_process_of_its_own_in_single_precision_finds_the_same(base, result, t
             "scores.json: cannot be written; expected a file in an existing",
         ),
         (["{run}", "--json", "{empty}"], "empty: cannot be written; expected a file in an existing folder"),
+        (
+            ["{run}", "--lpips-alex", "{missing}.npz"],
+            "missing.npz: cannot be read (No such file or directory); expected",
+        ),
     ],
 )
 def test_bad_input_is_one_sentence_and_exit_code_2(base, tmp_path, capsys, arguments, message):
@@ -253,7 +288,8 @@ def test_pixels_that_do_not_count_are_left_out_and_covisible_ones_scored(run, re
             split, images=spoil(split.images), welllit=spoil(split.welllit), valid=valid, covisible=seen
         )
         results.append(evaluate(dataclasses.replace(run, dataset=dataclasses.replace(run.dataset, test=test))))
-    assert results[0] == results[1]
+    flowless = [{key: scores for key, scores in found.items() if key != "temporal"} for found in results]
+    assert flowless[0] == flowless[1]  # flow looks at all pixels
     found = results[0]
     assert found["lowlight_regions"].keys() == {"dynamic", "static", "covisible"}
     assert found["welllit"].keys() == {"overall", "dynamic", "static", "covisible"}

@@ -1,9 +1,11 @@
 """Files and folders that are written whole or not at all."""
 
+import json
+
 import pytest
 
 from l2dgs_jax.errors import UserError
-from l2dgs_jax.runtime.files import append_line, new_folder, replacing
+from l2dgs_jax.runtime.files import append_line, new_folder, replacing, write_json
 
 
 def test_a_file_is_replaced_whole_or_not_at_all(tmp_path):
@@ -78,3 +80,12 @@ def test_a_line_that_cannot_be_added_is_one_sentence(tmp_path):
     assert (tmp_path / "lines").read_text() == "a\nb\n"
     with pytest.raises(UserError, match=r"nonsuch/lines: cannot be written \(No such file or directory\); expected"):
         append_line(tmp_path / "nonsuch" / "lines", "a")
+
+
+def test_json_has_strings_for_numbers_that_it_lacks(tmp_path):
+    refuse = lambda name: pytest.fail(f"{name} is no JSON")
+    infinite = float("inf")
+    write_json(tmp_path / "scores.json", {"psnr": infinite, "regions": [{"psnr": -infinite}, (float("nan"), 1.5)]})
+    read = json.loads((tmp_path / "scores.json").read_text(), parse_constant=refuse)
+    assert read == {"psnr": "Infinity", "regions": [{"psnr": "-Infinity"}, ["NaN", 1.5]]}
+    assert float(read["psnr"]) == infinite

@@ -206,9 +206,10 @@ def test_a_step_that_leaves_no_member_is_followed_too(monkeypatch):
 
 def test_the_table_shows_what_was_varied_and_scored(tmp_path):
     scores = {"gaussians": 7, "lowlight": {"psnr": 30.12345, "ssim": 0.9}}
+    perfect = {"gaussians": 7, "lowlight": {"psnr": "Infinity", "ssim": 1.0}}
     results = [
         {"scene": "/s/a", "varied": {"seed": 0, "loss.ssim": 0.5}, "ended": "finished", "scores": scores},
-        {"scene": "/s/b", "varied": {"seed": 0}, "ended": "diverged at step 3", "scores": scores},
+        {"scene": "/s/b", "varied": {"seed": 0}, "ended": "diverged at step 3", "scores": perfect},
     ]
     for name, result in zip("xy", results, strict=True):
         (tmp_path / name).mkdir()
@@ -221,6 +222,6 @@ def test_the_table_shows_what_was_varied_and_scored(tmp_path):
         "| scene | seed | loss.ssim | ended | Gaussians | low-light PSNR | low-light SSIM |",
         "| --- | --- | --- | --- | --- | --- | --- |",
         "| a | 0 | 0.5 | finished | 7 | 30.123 | 0.900 |",
-        "| b | 0 |  | diverged at step 3 | 7 | 30.123 | 0.900 |",
+        "| b | 0 |  | diverged at step 3 | 7 | inf | 1.000 |",
     ]
     assert (tmp_path / report.PLOTS).stat().st_size > 1000

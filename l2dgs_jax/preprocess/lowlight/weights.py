@@ -9,7 +9,8 @@ from jaxtyping import Shaped
 
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.preprocess.lowlight import curve_network
-from l2dgs_jax.runtime import torch_pickle
+from l2dgs_jax.runtime.arrays import expect_floats
+from l2dgs_jax.runtime.arrays import load as load_arrays
 from l2dgs_jax.runtime.files import replacing
 from l2dgs_jax.types import Conv
 
@@ -29,16 +30,10 @@ def load(path: Path = SHIPPED) -> curve_network.CurveNet:
     Raises:
         UserError: the file is missing, damaged, or of another network.
     """
-    arrays = _read_npz(path) if path.suffix == ".npz" else torch_pickle.load(path)
-    expected = _shapes(_width(path, arrays))
-    for name, shape in expected.items():
-        if name not in arrays:
-            raise UserError(f"{path}: '{name}' is missing; expected the layers {_LAYERS[0]} ... {_LAYERS[-1]}")
-        array = arrays[name]
-        if array.shape != shape or array.dtype.kind != "f" or not np.isfinite(array).all():
-            raise UserError(
-                f"{path}: '{name}' has shape {array.shape} and type {array.dtype}; expected {shape}, finite floats"
-            )
+    arrays = load_arrays(path, "weights of a curve network")
+    layers = f"the layers {_LAYERS[0]} ... {_LAYERS[-1]}"
+    for name, shape in _shapes(_width(path, arrays)).items():
+        expect_floats(path, arrays, name, shape, layers)
     convs = [
         Conv(_kernel(arrays[f"{layer}.weight"]), jnp.asarray(arrays[f"{layer}.bias"], jnp.float32)) for layer in _LAYERS
     ]
@@ -57,16 +52,6 @@ def save(path: Path, net: curve_network.CurveNet) -> None:
         arrays[f"{layer}.bias"] = np.asarray(conv.bias, np.float32)
     with replacing(path) as temporary, open(temporary, "wb") as file:
         np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
-
-
-def _read_npz(path: Path) -> dict[str, Shaped[np.ndarray, "..."]]:
-    try:
-        with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as file:
-            return dict(file)
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read ({error.strerror}); expected weights of a curve network") from None
-    except Exception:  # damaged archives raise whatever their bytes lead to
-        raise UserError(f"{path}: damaged or no .npz; expected weights of a curve network") from None
 
 
 def _width(path: Path, arrays: dict[str, Shaped[np.ndarray, "..."]]) -> int:

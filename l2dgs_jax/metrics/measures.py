@@ -1,0 +1,98 @@
+"""Measures of image quality, taken apart so that any part of an image can be scored by them."""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import cv2
+import jax
+import numpy as np
+from jaxtyping import Bool, Float
+
+from l2dgs_jax.metrics import lpips
+from l2dgs_jax.metrics.flip import flip_map
+from l2dgs_jax.metrics.images import NO_VALUE, RADIUS, Border, inside, partial_ssim, ssim_map
+from l2dgs_jax.metrics.multiscale import ms_ssim_maps, pool
+
+Pixels = Float[np.ndarray, "H W C"]
+Mask = Bool[np.ndarray, "H W"]
+Maps = Sequence[Float[np.ndarray, "_ _ _"]]
+
+
+class Measure(NamedTuple):
+    """A score made of means of local values.
+
+    Attributes:
+        maps: local values of a prediction and the truth, at one resolution or more, or `NO_VALUE`.
+        score: what the means of the maps, one number a channel, amount to.
+        masked: how a mask is scored from images that show nothing else, if not as `Measure.maps` of such images.
+        spread: whether the convention "paper" gives a region the whole frame's score times its area.
+    """
+
+    maps: Callable[[Pixels, Pixels], Maps]
+    score: Callable[[Sequence[Float[np.ndarray, " _"]]], float]
+    masked: Callable[[Pixels, Pixels, Mask], float] | None = None
+    spread: bool = False
+
+
+def mean_score(maps: Maps, measure: Measure, mask: Mask) -> float:
+    """The score of the pixels in `mask`, resized to each map as its nearest; NaN if a map has no value there."""
+    return measure.score([_mean(values, _nearest(mask, values.shape[:2])) for values in maps])
+
+
+def lpips_measure(network: lpips.Network, weights: lpips.Lpips | None) -> Measure:
+    """LPIPS by a network (arXiv 1801.03924), NaN without its weights.
+
+    "masked" it is the mean over the mask of maps enlarged to the image, as DyCheck's mLPIPS (arXiv 2210.13445).
+    """
+
+    def maps(a: Pixels, b: Pixels) -> Maps:
+        if weights is None or min(a.shape[:2]) < lpips.SMALLEST[network]:
+            return [np.full((1, 1, 1), NO_VALUE)]
+        return [np.asarray(x)[..., None] for x in _lpips_maps(network, weights, a, b)]
+
+    def masked(a: Pixels, b: Pixels, mask: Mask) -> float:
+        seen, (height, width) = mask[..., None], mask.shape
+        enlarged = [cv2.resize(x, (width, height), interpolation=cv2.INTER_LINEAR) for x in maps(a * seen, b * seen)]
+        return _total([_mean(x[..., None], mask) for x in enlarged])
+
+    return Measure(maps, _total, masked, spread=True)
+
+
+def _ssim(border: Border) -> Callable[[Pixels, Pixels], Maps]:
+    compiled = jax.jit(lambda a, b: ssim_map(a, b, border))
+
+    def maps(a: Pixels, b: Pixels) -> Maps:
+        similarity = np.asarray(compiled(a, b))
+        small = min(a.shape[:2]) <= 2 * RADIUS
+        return [similarity if border == "zero" or small else inside(similarity)]
+
+    return maps
+
+
+def _mean(values: Float[np.ndarray, "H W C"], mask: Mask) -> Float[np.ndarray, " C"]:
+    counted = values[mask & (values[..., 0] != NO_VALUE)]
+    return counted.mean(0, np.float64) if len(counted) else np.full(values.shape[2], np.nan)
+
+
+def _nearest(mask: Mask, shape: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
+    if mask.shape == shape:
+        return mask
+    return cv2.resize(mask.astype(np.uint8), shape[::-1], interpolation=cv2.INTER_NEAREST).astype(bool)
+
+
+def _decibel(means: Sequence[Float[np.ndarray, " _"]]) -> float:
+    with np.errstate(divide="ignore"):
+        return float(-10 * np.log10(means[0].mean()))
+
+
+def _total(means: Sequence[Float[np.ndarray, " _"]]) -> float:
+    return float(np.sum([mean.mean() for mean in means]))
+
+
+_partial_ssim, _lpips_maps = jax.jit(partial_ssim), jax.jit(lpips.lpips_maps, static_argnums=0)
+
+PSNR = Measure(lambda a, b: [(a - b) ** 2], _decibel)
+SSIM = Measure(_ssim("mirror"), _total, lambda a, b, mask: float(_partial_ssim(a, b, mask)))
+SSIM_3DGS = Measure(_ssim("zero"), _total)
+MS_SSIM = Measure(ms_ssim_maps, pool)
+FLIP = Measure(lambda a, b: [flip_map(a, b)[..., None]], _total)

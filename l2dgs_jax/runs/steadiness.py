@@ -1,0 +1,70 @@
+"""How steady the well-lit views of a run are from one to the next."""
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from l2dgs_jax import metrics
+from l2dgs_jax.data.dataset import Split
+from l2dgs_jax.metrics import Score
+from l2dgs_jax.training.flows import neighbour_flows
+
+
+def steadiness(welllit: Float[np.ndarray, "F H W 3"], split: Split, gain: float | None) -> dict:
+    """The warping error (arXiv 1808.00449) of views that follow each other in time, of the cameras next to each other.
+
+    It counts where optical flow there and back agree, between views of which that is most pixels.
+
+    Args:
+        welllit: the well-lit images of the split's views.
+        split: its truth, or where there is none its dark input, is what flow is found in.
+        gain: what the images are multiplied by, before they are clipped to [0, 1], to be scored a second time; None
+            without truth.
+
+    Returns:
+        What can be written as JSON:
+
+        * "flow": what it was found in, "truth" or "input";
+        * "pairs": how many views have one to follow them;
+        * "regions": for "overall", "dynamic", "static" and "covisible", as far as the split marks them,
+          "warping_error" of the images, "area", the part of the pixels that it was found in, and given a gain
+          "warping_error_gain" of the images times it and "warping_error_truth" of the truth, which is what errors of
+          the flow and changes of light amount to.
+    """
+    videos = {"warping_error": (welllit, 1.0)}
+    source = split
+    if split.welllit is not None and gain is not None:
+        videos |= {"warping_error_gain": (welllit, gain), "warping_error_truth": (split.welllit, 1.0)}
+        source = dataclasses.replace(split, images=split.welllit)
+    flows = neighbour_flows(source)
+
+    def shown(video: Float[np.ndarray, "F H W 3"], index: int, factor: float) -> Float[np.ndarray, "H W 3"]:
+        image = np.clip(np.float32(factor) * video[index].astype(np.float32), 0, 1)
+        return image if split.valid is None else np.where(split.valid[index][..., None], image, np.float32(np.nan))
+
+    def score(frame: int, after: int) -> dict[str, Score]:
+        flow = flows.displacements[frame, 0]
+        errors = {
+            name: metrics.warping_error_map(shown(video, frame, factor), shown(video, after, factor), flow)
+            for name, (video, factor) in videos.items()
+        }
+        known = np.isfinite(errors["warping_error"])
+        marks = (None if x is None else x[frame] for x in (split.masks, split.valid, split.covisible))
+        return {
+            region: {name: _mean(error, mask & known) for name, error in errors.items()}
+            | {"area": float((mask & known).mean())}
+            for region, mask in metrics.region_masks(flow.shape[:2], *marks).items()
+            if mask.any()
+        }
+
+    pairs = [(frame, after) for frame, after in enumerate(flows.following.tolist()) if after != frame]
+    return {
+        "flow": "input" if source is split else "truth",
+        "pairs": len(pairs),
+        "regions": metrics.summarise([score(frame, after) for frame, after in pairs]),
+    }
+
+
+def _mean(values: Float[np.ndarray, "H W"], mask: Bool[np.ndarray, "H W"]) -> float | None:
+    return float(values[mask].mean()) if mask.any() else None

@@ -1,0 +1,56 @@
+"""Named arrays of files that others made: NumPy's .npz, or what PyTorch saved."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Shaped
+
+from l2dgs_jax.errors import UserError
+from l2dgs_jax.runtime import torch_pickle
+
+
+def load(path: Path, expected: str) -> dict[str, Shaped[np.ndarray, "..."]]:
+    """Read an .npz, or a state_dict as torch.save writes it. Nothing that a file may ask for is run.
+
+    Args:
+        path: the file.
+        expected: what it should hold, for messages.
+
+    Raises:
+        UserError: the file is missing, damaged, or of another kind.
+    """
+    if path.suffix != ".npz":
+        return torch_pickle.load(path)
+    try:
+        with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as file:
+            return dict(file)
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read ({error.strerror}); expected {expected}") from None
+    except Exception:  # damaged archives raise whatever their bytes lead to
+        raise UserError(f"{path}: damaged or no .npz; expected {expected}") from None
+
+
+def expect_floats(
+    path: Path, arrays: Mapping[str, Shaped[np.ndarray, "..."]], name: str, shape: tuple[int, ...], expected: str
+) -> Shaped[np.ndarray, "..."]:
+    """One of a file's arrays.
+
+    Args:
+        path: the file, for messages.
+        arrays: all of them.
+        name: of the one.
+        shape: that it must have.
+        expected: what the file should hold, for messages.
+
+    Raises:
+        UserError: it is missing, has another shape, or holds something else than finite floats.
+    """
+    if name not in arrays:
+        raise UserError(f"{path}: '{name}' is missing; expected {expected}")
+    array = arrays[name]
+    if array.shape != shape or array.dtype.kind != "f" or not np.isfinite(array).all():
+        raise UserError(
+            f"{path}: '{name}' has shape {array.shape} and type {array.dtype}; expected {shape}, finite floats"
+        )
+    return array

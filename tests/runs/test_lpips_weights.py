@@ -1,0 +1,74 @@
+"""Weights of LPIPS from files of PyTorch and NumPy, whole or in parts, and what is said of others."""
+
+import networks
+import numpy as np
+import pytest
+from torch_files import saved
+
+from l2dgs_jax.errors import UserError
+from l2dgs_jax.metrics import NETWORKS
+from l2dgs_jax.runs.lpips_weights import load_lpips
+
+
+@pytest.fixture(autouse=True)
+def _tiny(monkeypatch):
+    monkeypatch.setitem(NETWORKS, "alex", networks.TINY)
+
+
+def torchvision(arrays):
+    """The trunk under torchvision's names, beside layers that LPIPS does without."""
+    trunk = {f"features.{name.split('.', 2)[2]}": x for name, x in arrays.items() if name.startswith("net")}
+    return trunk | {"classifier.1.weight": np.zeros((2, 3), np.float32)}
+
+
+def heads(arrays):
+    return {name: x for name, x in arrays.items() if name.startswith("lin")}
+
+
+def write(path, arrays):
+    if path.suffix == ".npz":
+        np.savez(path, **arrays)
+    else:
+        path.write_bytes(saved(arrays, legacy=False))
+    return path
+
+
+def test_all_ways_to_name_and_part_them_are_the_same(tmp_path):
+    arrays = networks.state_dict("alex")
+    renamed = {name.replace("lin", "lins.", 1): x for name, x in arrays.items()}
+    ways = {
+        "whole": [write(tmp_path / "whole.npz", arrays)],
+        "PyTorch": [write(tmp_path / "whole.pth", renamed)],
+        "parts": [write(tmp_path / "trunk.pth", torchvision(arrays)), write(tmp_path / "heads.npz", heads(arrays))],
+    }
+    for paths in ways.values():
+        found = load_lpips("alex", paths)
+        assert len(found.heads) == 2
+        for layer, conv in zip(networks.TINY, found.convs, strict=True):
+            place = next(name for name in arrays if name.endswith(f".{layer.place}.weight"))
+            np.testing.assert_array_equal(conv.weight, arrays[place].transpose(2, 3, 1, 0))
+        np.testing.assert_array_equal(found.heads[1], arrays["lin1.model.1.weight"].ravel())
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"lin1.model.1.weight": None}, r"'lin1.model.1.weight' is missing; expected .* AlexNet"),
+        ({"net.slice1.3.weight": np.zeros((6, 4, 5, 5), np.float32)}, r"'features.3.weight' has shape \(6, 4, 5, 5\)"),
+        ({"net.slice1.0.bias": np.full(4, np.inf, np.float32)}, "'features.0.bias' .* finite"),
+    ],
+    ids=["missing", "another network", "infinite"],
+)
+def test_other_weights_are_refused(tmp_path, changes, message):
+    arrays = {name: x for name, x in (networks.state_dict("alex") | changes).items() if x is not None}
+    path = write(tmp_path / "weights.npz", arrays)
+    with pytest.raises(UserError, match=message) as caught:
+        load_lpips("alex", [path])
+    assert str(path) in str(caught.value)
+
+
+def test_files_that_are_none_are_refused(tmp_path):
+    (tmp_path / "text.npz").write_text("weights")
+    for name, message in (("missing.npz", "cannot be read"), ("text.npz", "damaged or no .npz; expected weights")):
+        with pytest.raises(UserError, match=message):
+            load_lpips("alex", [tmp_path / name])
