@@ -1,14 +1,18 @@
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.test_util import check_grads
 
+from l2dgs_jax.config import ModelConfig
 from l2dgs_jax.model.decomposition import clip_unit, decompose, power
 from l2dgs_jax.model.networks import apply_bafe
 from l2dgs_jax.types import BAFENet, Conv, GroupNorm
 
-decompose_jit = jax.jit(decompose)
+CFG = ModelConfig()
+decompose_jit = jax.jit(partial(decompose, cfg=CFG))
 
 
 def make_bafe(dtype=jnp.float64):
@@ -33,7 +37,7 @@ def gradients(features, bafe):
     """Of the sum of all images."""
 
     def objective(features, bafe):
-        return sum(image.sum() for image in decompose(features, bafe))
+        return sum(image.sum() for image in decompose(features, bafe, CFG))
 
     return jax.grad(objective, (0, 1))(features, bafe)
 
@@ -68,7 +72,7 @@ def test_the_low_light_image_is_never_brighter():
 
 def test_gradients_of_the_images():
     features, bafe = make_features(2, 4, 5), make_bafe()
-    check_grads(jax.jit(decompose), (features, bafe), 1, ("rev",), 1e-5, 1e-5, eps=1e-6)
+    check_grads(decompose_jit, (features, bafe), 1, ("rev",), 1e-5, 1e-5, eps=1e-6)
 
 
 def test_gradients_of_power():
