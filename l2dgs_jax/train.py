@@ -79,7 +79,7 @@ def _train(options: Train) -> None:
             stack.enter_context(locked(folder))
         with memory_errors(lambda: "before the first step", LESS_MEMORY):
             dataset = load_dataset(options.scene, config.downscale, config.format, config.held_out, config.frame_memory)
-            dataset = enhanced(dataset, config.enhance, config.seed)
+            dataset = enhanced(dataset, config.enhance, int(config.seed))
             config = resolve(config, dataset)
             # What cannot start should leave no folder.
             start = standing(folder, dataset, config) if options.resume else Checkpoint(initial_state(dataset, config))

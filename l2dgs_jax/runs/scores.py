@@ -32,7 +32,8 @@ def evaluate(run: Run, split_name: str = "test") -> dict:
         * "lowlight": "psnr" and "ssim" of the estimate of the dark input against that input, and with masks
           "lowlight_regions", the same for "dynamic" and "static", and "mask_area", the dynamic part of all pixels;
           where the scene says what the training views have seen, "covisible" in "lowlight_regions", as DyCheck
-          (arXiv 2210.13445) scores it;
+          (arXiv 2210.13445) scores it. A scene learned from brightened frames (`Config.enhance`) has none of these:
+          it makes no estimate of the dark input;
         * with truth "welllit": for "overall" and each of those regions the "psnr" and "ssim" of the
           well-lit image as rendered, and "psnr_gain" and "ssim_gain" after it was multiplied by "gain" and clipped to
           [0, 1]: the one factor for all frames that, clipping included, leaves the least mean squared error;
@@ -62,18 +63,18 @@ def evaluate(run: Run, split_name: str = "test") -> dict:
             yield np.asarray(output.images.welllit, np.float16)
 
     welllit = stacked(relit(), split.images.shape, np.float16, in_file=isinstance(split.images, MappedArray))
-    scores = metrics.summarise(lowlight)
     result: dict = {
         "split": split_name,
         "stage": "fine" if run.moving else "coarse",
         "step": int(run.state.step),
         "gaussians": int(run.state.scene.alive.sum()),
         "frames": len(split.names),
-        "lowlight_gain": "own" if drifting else "none",
-        "lowlight": scores.pop("overall"),
     }
-    if split.masks is not None or split.covisible is not None:
-        result["lowlight_regions"] = scores
+    if run.config.enhance == "none":
+        scores = metrics.summarise(lowlight)
+        result |= {"lowlight_gain": "own" if drifting else "none", "lowlight": scores.pop("overall")}
+        if scores:
+            result["lowlight_regions"] = scores
     if split.masks is not None:
         result["mask_area"] = float(pixel_mean(split.masks, split.valid))
     if split.welllit is not None:
@@ -87,7 +88,9 @@ def evaluate(run: Run, split_name: str = "test") -> dict:
 
 def table(result: dict) -> str:
     """The scores that `evaluate` returns, as aligned text."""
-    rows = [("low light" if result["lowlight_gain"] == "none" else "low light x gain", result["lowlight"])]
+    rows = []
+    if "lowlight" in result:
+        rows.append(("low light" if result["lowlight_gain"] == "none" else "low light x gain", result["lowlight"]))
     rows += [(f"  {region}", scores) for region, scores in result.get("lowlight_regions", {}).items()]
     for region, scores in result.get("welllit", {}).items():
         rows.append(("well-lit" if region == "overall" else f"  {region}", scores))

@@ -38,7 +38,7 @@ def load_groups(spec: Spec) -> list[list[Trial]]:
         source = (plan.scene, c.downscale, c.format, c.held_out, c.frame_memory)
         key = (*source, c.enhance, c.enhance != "none" and c.seed)
         if key not in datasets:
-            datasets[key] = enhanced(load_dataset(*source), c.enhance, c.seed)
+            datasets[key] = enhanced(load_dataset(*source), c.enhance, int(c.seed))
         dataset = datasets[key]
         trial = Trial(plan, dataset, resolve(c, dataset))
         groups.setdefault((overrides.outline(trial.config), *_shapes(trial).values()), []).append(trial)
