@@ -65,7 +65,7 @@ def loss(net: Net, images: Float[Array, "B H W 3"]) -> Scalar:
 def learn(images: Float[np.ndarray, "F H W 3"], seed: int) -> Net:
     """A network for the pictures of one scene, sRGB values in [0, 1]."""
     net = init(jax.random.key(seed))
-    rate = Schedule(*(jnp.float32(value) for value in (*RATES, STEPS)))
+    rate = Schedule(*(jnp.asarray(value, float) for value in (*RATES, STEPS)))
     for net, _ in train(net, _crops(images, seed), rate, loss):  # noqa: B007, B020
         pass
     return net
