@@ -77,7 +77,8 @@ def _scene(study: Path, scene: str, members: Sequence[dict[str, Any]], count: in
     if split.welllit is not None:
         pictures["truth"] = [_url(to_bytes(split.welllit[i])) for i in chosen]
     times = [float(time) for time in split.cameras.time[chosen]]
-    return {"name": Path(scene).name, "times": times, "pictures": pictures}
+    size = split.images.shape[2:0:-1]
+    return {"name": Path(scene).name, "size": size, "times": times, "pictures": pictures}
 
 
 def _url(picture: UInt8[np.ndarray, "H W 3"]) -> str:

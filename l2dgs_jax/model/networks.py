@@ -160,7 +160,7 @@ def bounded_exponents(bafe: BAFENet, attenuation: Float[Array, "*B H W 2"]) -> F
 
     Gradients flow to both arguments.
     """
-    return _bound(attenuation + bafe.out.bias)
+    return _bound(attenuation + jnp.broadcast_to(bafe.out.bias, attenuation.shape))
 
 
 def _bound(x: Float[Array, "*S"]) -> Float[Array, "*S"]:
