@@ -7,6 +7,7 @@ The page holds everything, works offline, and leaves each person's answers as a 
 in it, dealt anew for every scene; which is which stands in the key file alone. Keep that from those who judge.
 """
 
+import hashlib
 import json
 import sys
 from collections.abc import Sequence
@@ -18,9 +19,10 @@ import numpy as np
 import tyro
 
 from experiments.web_page import data_url, write_page
+from l2dgs_jax.data.parsing import read_json
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.runtime import command_line
-from l2dgs_jax.runtime.files import write_json
+from l2dgs_jax.runtime.files import is_taken, write_json
 
 CRITERIA = (
     "Natural-looking brightness and lighting",
@@ -76,13 +78,18 @@ def main(arguments: Sequence[str]) -> None:
     if isinstance(options, Page):
         make_page(options)
         return
-    result = aggregate(_read(options.key), {path: _read(path) for path in options.answers})
+    key = read_json(options.key, "a key that `page` wrote")
+    result = aggregate(key, {path: read_json(path, "answers that the page left") for path in options.answers})
     print(markdown(result))
     if options.json is not None:
         write_json(options.json, result)
 
 
 def make_page(options: Page) -> None:
+    key_file = options.output.with_suffix(".key.json")
+    for path in (options.output, key_file):
+        if is_taken(path):
+            raise UserError(f"{path}: exists, and answers may depend on it; expected a new name for the page")
     files = _media(options.media)
     methods = [name for name in files if name != INPUT]
     rng = np.random.default_rng(options.seed)
@@ -96,12 +103,13 @@ def make_page(options: Page) -> None:
         if INPUT in files:
             shown = {INPUT: files[INPUT][scene]} | shown
         scenes.append({"name": name, "media": {k: data_url(path.read_bytes(), path.name) for k, path in shown.items()}})
-    study = f"{options.output.stem}-{options.seed}"
+    study = f"{options.output.stem}-{hashlib.sha256(json.dumps(key).encode()).hexdigest()[:8]}"
     data = {"study": study, "kind": options.kind, "criteria": CRITERIA, "letters": letters, "scenes": scenes}
     write_page(options.output, Path(__file__).with_suffix(".html"), data)
-    path = options.output.with_suffix(".key.json")
-    write_json(path, {"study": study, "methods": methods, "key": key})
-    print(f"wrote {options.output}, {len(scenes)} scenes of {len(methods)} methods, and {path}: keep that from judges")
+    write_json(key_file, {"study": study, "methods": methods, "key": key})
+    print(
+        f"wrote {options.output}, {len(scenes)} scenes of {len(methods)} methods, and {key_file}: keep that from judges"
+    )
 
 
 def _media(folder: Path) -> dict[str, dict[str, Path]]:
@@ -200,18 +208,6 @@ def markdown(result: dict[str, Any]) -> str:
 
 def _text(cell: dict[str, float] | None, digits: int) -> str:
     return "–" if cell is None else "{value:.{d}f} [{low:.{d}f}, {high:.{d}f}]".format(d=digits, **cell)
-
-
-def _read(path: Path) -> dict[str, Any]:
-    try:
-        content = json.loads(path.read_text())
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read ({error.strerror}); expected a JSON file") from None
-    except ValueError as error:
-        raise UserError(f"{path}: is no JSON ({error}); expected a file of the page or its key") from None
-    if not isinstance(content, dict):
-        raise UserError(f"{path}: is no object of JSON; expected a file of the page or its key")
-    return content
 
 
 if __name__ == "__main__":

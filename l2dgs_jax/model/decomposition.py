@@ -30,8 +30,13 @@ def decompose(features: Float[Array, "*B H W 6"], bafe: BAFENet, cfg: ModelConfi
     illumination, reflectance, attenuation = fusion_boundary(channels.unpack)(features)
     illumination, reflectance = clip_unit(illumination), clip_unit(reflectance)
     if cfg.decomposition == "none":
-        ones = jnp.ones_like(illumination), jnp.ones_like(attenuation)
-        return Decomposition(reflectance, reflectance, ones[0], reflectance, ones[1])
+        return Decomposition(
+            welllit=reflectance,
+            lowlight=reflectance,
+            illumination=jnp.ones_like(illumination),
+            reflectance=reflectance,
+            attenuation=jnp.ones_like(attenuation),
+        )
     attenuation = apply_bafe(bafe, attenuation) if cfg.bafe else bounded_exponents(bafe, attenuation)
     if cfg.unit_exponent is not None:
         attenuation = attenuation.at[..., ("b1", "b2").index(cfg.unit_exponent)].set(1)

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
+from tqdm import tqdm
 
 from l2dgs_jax.model.networks import apply_conv, init_conv
 from l2dgs_jax.preprocess.lowlight.curve_network import block_means, iterate, smoothness_loss, squared_steps, train
@@ -66,7 +67,8 @@ def learn(images: Float[np.ndarray, "F H W 3"], seed: int) -> Net:
     """A network for the pictures of one scene, sRGB values in [0, 1]."""
     net = init(jax.random.key(seed))
     rate = Schedule(*(jnp.asarray(value, float) for value in (*RATES, STEPS)))
-    for net, _ in train(net, _crops(images, seed), rate, loss):  # noqa: B007, B020
+    bar = tqdm(_crops(images, seed), total=STEPS, desc="brighten", unit="step", dynamic_ncols=True, disable=None)
+    for net, _ in train(net, bar, rate, loss):  # noqa: B007, B020
         pass
     return net
 

@@ -107,6 +107,15 @@ def test_a_page_is_blind_and_its_order_comes_from_the_seed(tmp_path):
     assert "http" not in page
 
 
+def test_a_page_that_may_have_been_answered_is_not_written_over(tmp_path):
+    folder = media(tmp_path / "media")
+    user_study.main(["page", str(folder), str(tmp_path / "a.html")])
+    (tmp_path / "a.html").unlink()
+    with pytest.raises(UserError, match=r"a\.key\.json"):
+        user_study.main(["page", str(folder), str(tmp_path / "a.html"), "--seed", "1"])
+    assert not (tmp_path / "a.html").exists()
+
+
 @pytest.mark.parametrize(
     ("change", "naming"),
     [

@@ -142,6 +142,13 @@ def test_members_of_one_shape_are_one_group(scenes):
     assert a.model.initial_exponents[0] != "auto" != b.model.initial_exponents[0]
 
 
+def test_members_that_brighten_their_frames_have_frames_of_their_own(scenes):
+    (scenes / "study.toml").write_text('scenes = ["a"]\npreset = "4dgs"\n[grid]\nenhance = ["none", "gamma"]')
+    (dark,), (bright,) = load_groups(read(scenes / "study.toml"))
+    assert bright.dataset.train.images.mean() > 1.5 * dark.dataset.train.images.mean()
+    np.testing.assert_array_equal(bright.dataset.test.images, dark.dataset.test.images)
+
+
 @pytest.mark.parametrize(
     ("text", "naming"),
     [
