@@ -36,6 +36,8 @@ class Gaussians(NamedTuple):
         gate: how much of the motion field acts, before the sigmoid; None: all of it.
         paths: displacements, as K control points of a cubic spline over [0, 1], world units; None: no Gaussian has one.
         lifetimes: the first and the last instant at which a Gaussian with a path is there; infinite for those without.
+        color_rest: SH coefficients 2 ... J of a colour that `reflectance` is the constant part of, in scenes that are
+            not decomposed; None in those that are.
     """
 
     means: Float[Array, "*B N 3"]
@@ -49,6 +51,7 @@ class Gaussians(NamedTuple):
     gate: Float[Array, "*B N"] | None = None
     paths: Float[Array, "*B N K 3"] | None = None
     lifetimes: Float[Array, "*B N 2"] | None = None
+    color_rest: Float[Array, "*B N 3 J1"] | None = None
 
 
 class MovedGaussians(NamedTuple):
@@ -60,7 +63,7 @@ class MovedGaussians(NamedTuple):
         scales: standard deviations in world units.
         opacities: in [0, 1]; exactly 0 for rows that are not alive.
         illumination: l of Eq. 3, seen from the camera of that instant.
-        reflectance: r of Eq. 6.
+        reflectance: r of Eq. 6, or in scenes that are not decomposed the colour seen from the camera of that instant.
         attenuation: (b1, b2) of Eq. 8.
     """
 

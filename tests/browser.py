@@ -1,7 +1,10 @@
-"""A browser that plays a video and says what it saw."""
+"""A browser that plays a video and says what it saw, or opens a page and does what a script says."""
 
+import html
 import http.server
+import json
 import queue
+import re
 import subprocess
 import threading
 from urllib.parse import unquote
@@ -54,3 +57,21 @@ def played(path, profile, seconds=30):
             finally:
                 browser.terminate()
                 server.shutdown()
+
+
+def result_of(page, script, folder):
+    """What `script`, the body of a function run once the page has loaded, returns; None if it fails."""
+    ending = f"""<script>
+    addEventListener("load", () => {{
+      const found = (() => {{ {script} }})();
+      const said = document.createElement("pre");
+      said.textContent = JSON.stringify(found);
+      document.body.replaceChildren(said);
+    }});
+    </script>"""
+    driven = folder / "driven.html"
+    driven.write_text(page.read_text() + ending)
+    options = ["--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={folder / 'profile'}", "--dump-dom"]
+    ran = subprocess.run(["chromium", *options, driven.as_uri()], capture_output=True, text=True, timeout=60)
+    found = re.search("<pre>(.*?)</pre>", ran.stdout, flags=re.S)
+    return json.loads(html.unescape(found[1])) if found else None

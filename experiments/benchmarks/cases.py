@@ -122,7 +122,7 @@ def parts() -> Figures:
     drawn = jax.jit(draw)(moved, blended)
 
     def judge(features, bafe):
-        output = RenderOutput(decompose(features, bafe), *drawn[1:3], drawn.radii, drawn.pairs, drawn.overflow)
+        output = RenderOutput(decompose(features, bafe, cfg), *drawn[1:3], drawn.radii, drawn.pairs, drawn.overflow)
         return losses.total(output, images, CONFIG.loss, 0.9, 1.5)[0]
 
     def mlps(heads, ocd, field):

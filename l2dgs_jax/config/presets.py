@@ -1,7 +1,8 @@
 """The named presets; docs/presets.md says why each setting of `default` is what it is, and what it measures.
 
 `paper` is the text of the paper to the letter, `authors` what the authors' released code does, `default` what measures
-best, `fast` and `demo` a short `default`, `best` a long one.
+best, `fast` and `demo` a short `default`, `best` a long one. `4dgs`, `enhance-4dgs` and `static` are what to compare it
+with: baselines of the paper's Table 1, in as many steps.
 """
 
 import dataclasses
@@ -101,7 +102,44 @@ def _presets() -> dict[str, Config]:
         optim=dataclasses.replace(default.optim, decay_steps=None),
         density=dataclasses.replace(default.density, stop=0),
     )
-    return {"paper": paper, "authors": authors, "default": default, "fast": fast, "best": best, "demo": demo}
+    # 4DGS (arXiv 2310.08528): its model, objective, rates and schedule; steps and growth of `default`.
+    four_d = Config(
+        coarse_steps=default.coarse_steps,
+        fine_steps=default.fine_steps,
+        model=ModelConfig(
+            decomposition="none",
+            ocd=False,
+            time_size=150,
+            time_range="upper",
+            aggregation="product",
+            reflectance_init="observed",
+            background=1.0,
+        ),
+        loss=LossConfig(ssim=0.0, exposure=0.0, amplification=0.0, structure=0.0, depth=0.0),
+        optim=OptimConfig(
+            reflectance_lr=7e-4,  # 2.5e-3 for a coefficient of the constant harmonic, 0.28
+            decay_steps=None,
+        ),
+        density=default.density,
+    )
+    # The first stage, in which nothing moves, for as long as `default`; paths would move.
+    static = dataclasses.replace(
+        default,
+        coarse_steps=default.steps,
+        fine_steps=0,
+        model=dataclasses.replace(default.model, tracks=False),
+    )
+    return {
+        "paper": paper,
+        "authors": authors,
+        "default": default,
+        "fast": fast,
+        "best": best,
+        "demo": demo,
+        "4dgs": four_d,
+        "enhance-4dgs": dataclasses.replace(four_d, enhance="zero-dce"),
+        "static": static,
+    }
 
 
 PRESETS = _presets()

@@ -14,6 +14,7 @@ from l2dgs_jax.errors import UserError
 
 LayoutName = Literal["nerfies", "colmap", "transforms", "llff"]
 Layout = Literal["auto"] | LayoutName
+Enhancement = Literal["none", "gamma", "clahe", "zero-dce"]
 
 # Settings that a compiled step may take as arguments are numbers outside of it and traced scalars inside
 # (`overrides.combine`); the command line reads the plain kinds.
@@ -31,12 +32,14 @@ _PLAIN_NUMBER, _PLAIN_COUNT, _PLAIN_LENGTH = float, int, int | None
 _PLAIN_EXPONENTS = tuple[float | Literal["auto"], float] | None
 _PLAIN_MOST = int | Literal["auto"]
 _PLAIN_ILLUMINATION = float | Literal["auto"] | None
+_PLAIN_OPTIONAL = float | None
 Number = Annotated[_Float, _arg(_PLAIN_NUMBER)]
 Count = Annotated[_Int, _arg(_PLAIN_COUNT)]
 Length = Annotated[_Int | None, _arg(_PLAIN_LENGTH)]
 Exponents = Annotated[tuple[_Float | Literal["auto"], _Float] | None, _arg(_PLAIN_EXPONENTS)]
 Most = Annotated[_Int | Literal["auto"], _arg(_PLAIN_MOST)]
 Illumination = Annotated[_Float | Literal["auto"] | None, _arg(_PLAIN_ILLUMINATION)]
+OptionalNumber = Annotated[_Float | None, _arg(_PLAIN_OPTIONAL)]
 TRACEABLE: dict[Any, Any] = {
     Number: _PLAIN_NUMBER,
     Count: _PLAIN_COUNT,
@@ -44,6 +47,7 @@ TRACEABLE: dict[Any, Any] = {
     Exponents: _PLAIN_EXPONENTS,
     Most: _PLAIN_MOST,
     Illumination: _PLAIN_ILLUMINATION,
+    OptionalNumber: _PLAIN_OPTIONAL,
 }
 
 EPS = math.exp(-5)  # of Eq. 10
@@ -108,6 +112,14 @@ class ModelConfig:
     # Whether every training frame has a gain of its own, learned beside the scene; "auto": if the points say so
     exposure: Literal["steady", "drifting", "auto"] = "steady"
     background: float = 0.0  # value of L and R where nothing is drawn
+    # "retinex": Eqs. 5-9; "none": colours by spherical harmonics, as 4DGS (arXiv 2310.08528) has them, are both the
+    # low-light and the well-lit image (Table 1, 4DGS)
+    decomposition: Literal["retinex", "none"] = "retinex"
+    ocd: bool = True  # whether OCD-Net lights Gaussians anew at every instant; otherwise a_j = 1 (Table 3, w/o OCD-Net)
+    # Whether B1 and B2 come from BAFE-Net; otherwise from the blended features alone, brought to the same range (Table
+    # 3, w/o BAFE-Net)
+    bafe: bool = True
+    unit_exponent: Literal["b1", "b2"] | None = None  # the exponent that is 1 throughout (Table 3, B1 = 1 and B2 = 1)
 
 
 @dataclass(frozen=True)
@@ -126,8 +138,12 @@ class LossConfig:
     exposure_window: int | None = 16  # pixels; None: the mean of the whole image
     exposure_form: Literal["absolute", "squared"] = "absolute"
     amplification: Number = 0.05  # lambda_2, Eq. 13
-    structure: Number = 1.0  # lambda_3 = lambda_4, Eq. 14
-    structure_beta: Number = 0.5
+    # Weight of mean |1 - R_w|, beside Eq. 13 or instead of it (Table 3, L + 0.05 |1 - R_w| and Maximize R_w)
+    reflectance_amplification: Number = 0.0
+    structure: Number = 1.0  # lambda_3, Eq. 14
+    structure_illumination: OptionalNumber = None  # lambda_4, Eq. 14; None: as lambda_3
+    structure_beta: Number = 0.5  # beta_1, Eq. 14
+    structure_beta_illumination: OptionalNumber = None  # beta_2, Eq. 14; None: as beta_1
     structure_gradient: Literal["components", "magnitude"] = "components"  # forward differences, or sqrt(dx^2 + dy^2)
     depth: Number = 0.001  # lambda_5, Eq. 12
     depth_gradient: Literal["forward", "sobel"] = "forward"
@@ -219,6 +235,8 @@ class Config:
     keep_checkpoints: int = 2  # the last ones, in case that the very last is damaged
     # Share of the views that lie between two frames of the video, drawn by optical flow (training/inbetweens.py)
     inbetweens: float = 0.0
+    # How the frames are brightened before training, where low light is not modelled (preprocess/enhancement.py)
+    enhance: Enhancement = "none"
     frame_memory: float = 4.0  # GiB that a scene's frames may take; beyond it they lie in temporary files
     model: ModelConfig = field(default_factory=ModelConfig)
     loss: LossConfig = field(default_factory=LossConfig)

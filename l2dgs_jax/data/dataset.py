@@ -14,7 +14,7 @@ from l2dgs_jax.types import Camera
 
 
 class Source(NamedTuple):
-    """What `load_dataset` was asked for; `Config` has settings of the same names.
+    """What `load_dataset` was asked for, and what became of it; `Config` has settings of the same names.
 
     Attributes:
         scene: absolute path of its folder, or "demo".
@@ -22,6 +22,7 @@ class Source(NamedTuple):
         format: likewise.
         held_out: likewise.
         frame_memory: likewise.
+        enhance: how the training frames were brightened since (preprocess/enhancement.py).
     """
 
     scene: str
@@ -29,6 +30,7 @@ class Source(NamedTuple):
     format: str
     held_out: str
     frame_memory: float
+    enhance: str = "none"
 
     @property
     def settings(self) -> dict[str, Any]:

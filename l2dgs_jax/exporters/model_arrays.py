@@ -7,14 +7,24 @@ import numpy as np
 from jaxtyping import Shaped
 
 from l2dgs_jax.data.dataset import Split
+from l2dgs_jax.errors import UserError
 from l2dgs_jax.model.deformation import length_unit
 from l2dgs_jax.rasterizer.projection import NEAR_PLANE
 from l2dgs_jax.runs import Run
 
+WHOLE = {"decomposition": "retinex", "ocd": True, "bafe": True, "unit_exponent": None}  # settings of a model
+
 
 def model_arrays(run: Run) -> dict[str, Shaped[np.ndarray, "..."]]:
-    """The arrays of an exported .npz by name, numbers in single precision; docs/export.md describes each of them."""
+    """The arrays of an exported .npz by name, numbers in single precision; docs/export.md describes each of them.
+
+    Raises:
+        UserError: the scene lacks a part of the model that they are described to be.
+    """
     scene, cfg, dataset = run.state.scene, run.config.model, run.dataset
+    for name, whole in WHOLE.items():
+        if getattr(cfg, name) != whole:
+            raise UserError(f"{run.name}: its model.{name} is {getattr(cfg, name)}; expected {whole} for a whole model")
     params, alive = scene.params, np.asarray(scene.alive)
     gaussians = {name: rows for name, rows in params.gaussians._asdict().items() if rows is not None}
     coefficients = [gaussians.pop("illumination_dc"), gaussians.pop("illumination_rest")]

@@ -4,13 +4,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from l2dgs_jax.config import ModelConfig
 from l2dgs_jax.kernels.fusion import fusion_boundary, repeat_channels
 from l2dgs_jax.model import channels
-from l2dgs_jax.model.networks import apply_bafe
+from l2dgs_jax.model.networks import apply_bafe, bounded_exponents
 from l2dgs_jax.types import BAFENet, Decomposition
 
 
-def decompose(features: Float[Array, "*B H W 6"], bafe: BAFENet) -> Decomposition:
+def decompose(features: Float[Array, "*B H W 6"], bafe: BAFENet, cfg: ModelConfig) -> Decomposition:
     """Turn blended features into L_w, R_w, B1, B2, I_w and the estimate of I_d.
 
     Gradients flow, in reverse mode only, to `features` (L_w and R_w: only where they lie in [0, 1], both ends included)
@@ -19,14 +20,26 @@ def decompose(features: Float[Array, "*B H W 6"], bafe: BAFENet) -> Decompositio
     Args:
         features: blended channels, any real values (Eqs. 5, 6, 8; see `channels`).
         bafe: parameters of BAFE-Net.
+        cfg: `decomposition`, `bafe` and `unit_exponent`.
 
     Returns:
         The images of Eqs. 5-9; a base of 0 stays 0 in the low-light image and passes no gradient to its exponent.
+        Without a decomposition both images are the blended colour, and L_w and the exponents are 1.
     """
     # Without a boundary the losses' gradient would be computed again for each of the channels.
     illumination, reflectance, attenuation = fusion_boundary(channels.unpack)(features)
     illumination, reflectance = clip_unit(illumination), clip_unit(reflectance)
-    attenuation = apply_bafe(bafe, attenuation)
+    if cfg.decomposition == "none":
+        return Decomposition(
+            welllit=reflectance,
+            lowlight=reflectance,
+            illumination=jnp.ones_like(illumination),
+            reflectance=reflectance,
+            attenuation=jnp.ones_like(attenuation),
+        )
+    attenuation = apply_bafe(bafe, attenuation) if cfg.bafe else bounded_exponents(bafe, attenuation)
+    if cfg.unit_exponent is not None:
+        attenuation = attenuation.at[..., ("b1", "b2").index(cfg.unit_exponent)].set(1)
     return Decomposition(
         welllit=repeat_channels(illumination, 3) * reflectance,
         lowlight=repeat_channels(power(illumination, attenuation[..., 1]), 3)

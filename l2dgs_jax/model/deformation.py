@@ -51,7 +51,8 @@ def deform(
     per_view = lambda rows: jnp.broadcast_to(rows[None], (*cameras.time.shape, *rows.shape))
     raw = (gaussians.means, gaussians.quats, gaussians.log_scales, gaussians.logit_opacities)
     means, quats, log_scales, logit_opacities = map(per_view, raw)
-    coefficients = _active_coefficients(gaussians, cfg.sh_degree, sh_degree_active)
+    dc_and_rest = jnp.concatenate([gaussians.illumination_dc, gaussians.illumination_rest], axis=-1)
+    coefficients = _active(dc_and_rest, cfg.sh_degree, sh_degree_active)[None]  # b_j of Eq. 2
     if moving:
         changes = _changes(scene, gaussians, cameras, cfg, chances)
         means += length_unit(scene.extent, cfg) * changes.motion.means
@@ -59,25 +60,31 @@ def deform(
         log_scales += changes.motion.log_scales
         if changes.motion.logit_opacities is not None:
             logit_opacities += changes.motion.logit_opacities
-        coefficients = (1 + changes.light) * coefficients
+        if changes.light is not None:
+            coefficients = (1 + changes.light) * coefficients
     opacities = jnp.where(alive[None], jax.nn.sigmoid(logit_opacities), 0)
     if gaussians.paths is not None and gaussians.lifetimes is not None:
         displacements, there = _on_paths(gaussians.paths, gaussians.lifetimes, cameras.time)
         means, opacities = means + displacements, there * opacities
+    basis = _basis(gaussians.means, cameras.viewmat, cfg.sh_degree)
+    reflectance = per_view(gaussians.reflectance)
+    if gaussians.color_rest is not None:
+        rest = _active(gaussians.color_rest, cfg.sh_degree, sh_degree_active)
+        reflectance = jnp.maximum(reflectance + jnp.einsum("ncj,vnj->vnc", rest, basis[..., 1:]), 0)
     return MovedGaussians(
         means=means,
         quats=quats,
         scales=jnp.exp(log_scales),
         opacities=opacities if presence is None else jnp.minimum(presence[None] * opacities, 1),
-        illumination=_illumination(coefficients, gaussians.means, cameras.viewmat, cfg),
-        reflectance=per_view(gaussians.reflectance),
+        illumination=jnp.maximum(cfg.illumination_offset + jnp.sum(coefficients * basis, axis=-1), 0),
+        reflectance=reflectance,
         attenuation=per_view(gaussians.attenuation),
     )
 
 
 class _Changes(NamedTuple):
     motion: networks.Motion
-    light: Float[Array, "V N J"]  # a_j - 1
+    light: Float[Array, "V N J"] | None  # a_j - 1
 
 
 def _changes(
@@ -97,7 +104,7 @@ def _changes(
     # The same features feed the heads and OCD-Net: Eqs. 1 and 4 name them both f.
     field = hexplane.features(scene.params.hexplane, chosen(gaussians.means), scene.bounds, cameras.time, cfg)
     hidden, motion = networks.apply_heads(scene.params.heads, field)
-    changes = _Changes(motion, networks.apply_ocd(scene.params.ocd, hidden) - 1)
+    changes = _Changes(motion, networks.apply_ocd(scene.params.ocd, hidden) - 1 if cfg.ocd else None)
     if gate is not None:
         factor = jax.nn.sigmoid(chosen(gate))
         changes = jax.tree.map(lambda rows: factor.reshape(1, -1, *[1] * (rows.ndim - 2)) * rows, changes)
@@ -135,22 +142,18 @@ def length_unit(extent: Float[Array, ""] | float, cfg: ModelConfig) -> Float[Arr
     return extent if cfg.unit == "depth" else 1.0
 
 
-def _active_coefficients(gaussians: Gaussians, degree: int, active: Int[Array, ""] | int) -> Float[Array, "1 N J"]:
-    """The b_j of Eq. 2, those of bands above `active` set to zero."""
-    coefficients = jnp.concatenate([gaussians.illumination_dc, gaussians.illumination_rest], axis=-1)
-    bands = np.repeat(np.arange(degree + 1, dtype=np.int32), 2 * np.arange(degree + 1) + 1)
-    return jnp.where((bands <= jnp.asarray(active, jnp.int32))[None], coefficients, 0)[None]
-
-
-def _illumination(
-    coefficients: Float[Array, "U N J"], means: Float[Array, "N 3"], viewmat: Float[Array, "V 4 4"], cfg: ModelConfig
-) -> Float[Array, "V N"]:
-    """The illumination l of Eqs. 2 and 3, coefficients a_j b_j given for each view or once for all.
+def _basis(means: Float[Array, "N 3"], viewmat: Float[Array, "V 4 4"], degree: int) -> Float[Array, "V N J"]:
+    """The spherical harmonics of Eqs. 2 and 3 towards each Gaussian.
 
     The view direction is taken from the canonical mean: the coefficients belong to the Gaussian, so its motion alone
     does not change how it is lit. What does change is OCD-Net's part.
     """
-    centres = camera_centres(viewmat)
-    directions = spherical_harmonics.directions(jnp.broadcast_to(means[None], (len(viewmat), *means.shape)), centres)
-    lit = jnp.sum(coefficients * spherical_harmonics.basis(directions, cfg.sh_degree), axis=-1)
-    return jnp.maximum(cfg.illumination_offset + lit, 0)
+    everywhere = jnp.broadcast_to(means[None], (len(viewmat), *means.shape))
+    return spherical_harmonics.basis(spherical_harmonics.directions(everywhere, camera_centres(viewmat)), degree)
+
+
+def _active(coefficients: Float[Array, "*S J"], degree: int, active: Int[Array, ""] | int) -> Float[Array, "*S J"]:
+    """Coefficients of spherical harmonics, all or without the first, those of bands above `active` set to zero."""
+    bands = np.repeat(np.arange(degree + 1, dtype=np.int32), 2 * np.arange(degree + 1) + 1)
+    used = bands[len(bands) - coefficients.shape[-1] :] <= jnp.asarray(active, jnp.int32)
+    return jnp.where(used.reshape(*[1] * (coefficients.ndim - 1), -1), coefficients, 0)

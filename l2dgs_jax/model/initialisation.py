@@ -178,7 +178,7 @@ def _initialise(
     capacity: int,
 ) -> Scene:
     """See `initialise`; `illumination` is what the spherical harmonics are to give, their offset taken off."""
-    count = len(points)
+    count, num_rest = len(points), (cfg.sh_degree + 1) ** 2 - 1
     keys = jax.random.split(key, 6)
     random = {"normal": jax.random.normal, "uniform": jax.random.uniform}
     gaussians = Gaussians(
@@ -187,12 +187,13 @@ def _initialise(
         log_scales=jnp.tile(log_scales[:, None], (1, 3)),
         logit_opacities=logit_opacities,
         illumination_dc=illumination[:, None] / SH_DC,
-        illumination_rest=jnp.zeros((count, (cfg.sh_degree + 1) ** 2 - 1)),
+        illumination_rest=jnp.zeros((count, num_rest)),
         reflectance=random[cfg.reflectance_init](keys[0], (count, 3)) if reflectance is None else reflectance,
         attenuation=random[cfg.attenuation_init](keys[1], (count, 2)),
         gate=jnp.full(count, OPEN_GATE) if cfg.motion_gate else None,
         paths=paths,
         lifetimes=lifetimes,
+        color_rest=jnp.zeros((count, 3, num_rest)) if cfg.decomposition == "none" else None,
     )
     params = SceneParams(
         gaussians=jax.tree.map(lambda rows: pad_rows(rows, capacity), gaussians),

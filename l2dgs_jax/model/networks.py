@@ -152,8 +152,19 @@ def apply_bafe(bafe: BAFENet, attenuation: Float[Array, "*B H W 2"]) -> Float[Ar
     first = leaky(_group_norm(bafe.norm1, apply_conv(bafe.conv1, x), 2))
     second = leaky(_group_norm(bafe.norm2, apply_conv(bafe.conv2, first), 4))
     third = leaky(_group_norm(bafe.norm3, apply_conv(bafe.conv3, second), 2) + SKIP_GAIN * first)
-    exponents = EXPONENT_CENTRE + EXPONENT_REACH * jax.nn.soft_sign(apply_conv(bafe.out, third))
-    return exponents.reshape(attenuation.shape)
+    return _bound(apply_conv(bafe.out, third)).reshape(attenuation.shape)
+
+
+def bounded_exponents(bafe: BAFENet, attenuation: Float[Array, "*B H W 2"]) -> Float[Array, "*B H W 2"]:
+    """Exponents in (1, 10) of the rasterized (b1, b2) alone: of BAFE-Net only the last bias, and the range, are left.
+
+    Gradients flow to both arguments.
+    """
+    return _bound(attenuation + jnp.broadcast_to(bafe.out.bias, attenuation.shape))
+
+
+def _bound(x: Float[Array, "*S"]) -> Float[Array, "*S"]:
+    return EXPONENT_CENTRE + EXPONENT_REACH * jax.nn.soft_sign(x)
 
 
 def _xavier(key: PRNGKeyArray, shape: tuple[int, ...], fan_in: int, fan_out: int) -> Float[Array, "..."]:

@@ -72,7 +72,7 @@ def render(
         lit = channels.LIT[None, None, None]
         features = features + cfg.background * jnp.where(lit, 1 - drawn.alpha[..., None], 0)
     return RenderOutput(
-        images=decompose(features, scene.params.bafe),
+        images=decompose(features, scene.params.bafe, cfg),
         alpha=drawn.alpha,
         depth=drawn.depth,
         radii=drawn.radii,

@@ -18,7 +18,9 @@ _AFTER_GAIN = {
 
 def table(result: dict) -> str:
     """The scores that `runs.scores.evaluate` returns, as aligned text."""
-    rows = [("low light" if result["lowlight_gain"] == "none" else "low light x gain", result["lowlight"])]
+    rows = []
+    if "lowlight" in result:
+        rows.append(("low light" if result["lowlight_gain"] == "none" else "low light x gain", result["lowlight"]))
     rows += [(f"  {region}", scores) for region, scores in result.get("lowlight_regions", {}).items()]
     for region, scores in result.get("welllit", {}).items():
         rows.append(("well-lit" if region == "overall" else f"  {region}", scores))

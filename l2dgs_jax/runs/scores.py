@@ -48,7 +48,8 @@ def evaluate(
         * "lowlight": "psnr" and "ssim" of the estimate of the dark input against that input, and with masks
           "lowlight_regions", the same for "dynamic" and "static", and "mask_area", the dynamic part of all pixels;
           where the scene says what the training views have seen, "covisible" in "lowlight_regions", as DyCheck
-          (arXiv 2210.13445) scores it;
+          (arXiv 2210.13445) scores it. A scene learned from brightened frames (`Config.enhance`) has none of these:
+          it makes no estimate of the dark input;
         * with truth "welllit": for "overall" and each of those regions "psnr", "ssim", "ssim_3dgs", "ms_ssim", "flip",
           "lpips_alex" and "lpips_vgg" of the well-lit image as rendered, and the same with "_gain" after it was
           multiplied by "gain" and clipped to [0, 1]: the one factor for all frames that, clipping included, leaves the
@@ -80,7 +81,6 @@ def evaluate(
             yield np.asarray(output.images.welllit, np.float16)
 
     welllit = stacked(relit(), split.images.shape, np.float16, in_file=isinstance(split.images, MappedArray))
-    scores = metrics.summarise(lowlight)
     result: dict = {
         "split": split_name,
         "stage": "fine" if run.moving else "coarse",
@@ -88,11 +88,12 @@ def evaluate(
         "gaussians": int(run.state.scene.alive.sum()),
         "frames": len(split.names),
         "region_convention": convention,
-        "lowlight_gain": "own" if drifting else "none",
-        "lowlight": scores.pop("overall"),
     }
-    if split.masks is not None or split.covisible is not None:
-        result["lowlight_regions"] = scores
+    if run.config.enhance == "none":
+        scores = metrics.summarise(lowlight)
+        result |= {"lowlight_gain": "own" if drifting else "none", "lowlight": scores.pop("overall")}
+        if scores:
+            result["lowlight_regions"] = scores
     if split.masks is not None:
         result["mask_area"] = float(pixel_mean(split.masks, split.valid))
     if split.welllit is not None:

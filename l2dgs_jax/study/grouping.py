@@ -8,6 +8,7 @@ from l2dgs_jax.config import Config, overrides
 from l2dgs_jax.data import load_dataset
 from l2dgs_jax.data.dataset import Dataset
 from l2dgs_jax.errors import UserError
+from l2dgs_jax.preprocess.enhancement import enhanced
 from l2dgs_jax.study.spec import Plan, Spec
 from l2dgs_jax.training import resolve
 
@@ -35,9 +36,10 @@ def load_groups(spec: Spec) -> list[list[Trial]]:
     for plan in spec.plans:
         c = plan.config
         source = (plan.scene, c.downscale, c.format, c.held_out, c.frame_memory)
-        if source not in datasets:
-            datasets[source] = load_dataset(*source)
-        dataset = datasets[source]
+        key = (*source, c.enhance, c.enhance != "none" and c.seed)
+        if key not in datasets:
+            datasets[key] = enhanced(load_dataset(*source), c.enhance, int(c.seed))
+        dataset = datasets[key]
         trial = Trial(plan, dataset, resolve(c, dataset))
         groups.setdefault((overrides.outline(trial.config), *_shapes(trial).values()), []).append(trial)
     if spec.one_program and len(groups) > 1:

@@ -169,6 +169,7 @@ def _score(trial: Trial, output: Path) -> None:
     diverged = (folder / DIVERGED).exists()
     result = {
         "scene": trial.plan.scene,
+        "variant": trial.plan.variant,
         "varied": trial.plan.varied,
         "ended": f"diverged at step {int(state.step)}" if diverged else "finished",
         "scores": evaluate(run),

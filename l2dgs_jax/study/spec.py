@@ -2,6 +2,7 @@
 
 import itertools
 import tomllib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,12 +19,15 @@ class Plan:
 
     Attributes:
         name: unique, fit for a folder's name.
+        variant: name of the variant that it is of; empty if there are none.
         scene: its folder, or "demo".
         config: its settings.
-        varied: the settings that the study varies, by dotted name, with this member's values.
+        varied: the settings that the study varies, by dotted name, with this member's values, and its "preset" if the
+            variant has one of its own.
     """
 
     name: str
+    variant: str
     scene: str
     config: Config
     varied: dict[str, Any]
@@ -37,13 +41,17 @@ class Spec:
     one_program: bool
 
 
-def read(path: Path) -> Spec:
+def read(path: Path, scenes: Sequence[str] = ()) -> Spec:
     """Read a study from a TOML file.
 
     Its keys: `scenes` (folders, seen from the file's own, or "demo"), `seeds` ([0] if not given), `preset` ("default"),
     `[settings]` for all members, `[grid]` with a list of values for each setting, of which every combination is a
-    member, `[[variants]]` with a `name` and settings each, and `one_program`. Members are all scenes x seeds x
-    combinations x variants.
+    member, `[[variants]]` with a `name` and settings each, if need be with a `preset` of their own, and `one_program`.
+    Members are all scenes x seeds x combinations x variants.
+
+    Args:
+        path: the file.
+        scenes: in place of those in the file: absolute paths, or "demo".
 
     Raises:
         UserError: the file cannot be read, or a key or value in it is none of these.
@@ -52,11 +60,9 @@ def read(path: Path) -> Spec:
     unknown = sorted(content.keys() - set(KEYS))
     if unknown:
         raise UserError(f"{path}: the key '{unknown[0]}' is unknown; expected {', '.join(KEYS)}")
-    scenes = [_scene(path, scene) for scene in _list(path, content, "scenes", str)]
+    scenes = scenes or [_scene(path, scene) for scene in _list(path, content, "scenes", str)]
     seeds = _list(path, content, "seeds", int) if "seeds" in content else [0]
-    preset = content.get("preset", "default")
-    if preset not in PRESETS:
-        raise UserError(f"{path}: no preset is called {preset!r}; expected one of {', '.join(PRESETS)}")
+    preset = _preset(path, content.get("preset", "default"))
     one_program = content.get("one_program", False)
     if not isinstance(one_program, bool):
         raise UserError(f"{path}: one_program is {one_program!r}; expected true or false")
@@ -65,15 +71,16 @@ def read(path: Path) -> Spec:
     variants = _variants(path, content.get("variants", [{}]))
 
     plans: list[Plan] = []
-    for scene, seed, point, (label, variant) in itertools.product(scenes, seeds, grid, variants):
+    for scene, seed, point, (label, own_preset, variant) in itertools.product(scenes, seeds, grid, variants):
         varied = {"seed": seed, **point, **variant}
         try:
-            config = overrides.replace(PRESETS[preset], settings | varied)
+            config = overrides.replace(PRESETS[own_preset or preset], settings | varied)
             config.check_counts()
         except UserError as error:
             raise UserError(f"{path}: {error}") from None
         parts = [f"{len(plans):02d}", Path(scene).name, f"seed{seed}", *_labels(point), *([label] if label else [])]
-        plans.append(Plan("-".join(parts), scene, config, varied))
+        shown = {"seed": seed} | ({"preset": own_preset} if own_preset else {}) | varied
+        plans.append(Plan("-".join(parts), label, scene, config, shown))
     return Spec(tuple(plans), one_program)
 
 
@@ -138,16 +145,26 @@ def _grid(path: Path, table: Any) -> list[dict[str, Any]]:
     return [dict(point) for point in itertools.product(*columns)]
 
 
-def _variants(path: Path, tables: Any) -> list[tuple[str, dict[str, Any]]]:
-    """Names of the variants and their settings; a single one without any if there are none."""
+def _preset(path: Path, name: Any) -> str:
+    if name not in PRESETS:
+        raise UserError(f"{path}: no preset is called {name!r}; expected one of {', '.join(PRESETS)}")
+    return name
+
+
+def _variants(path: Path, tables: Any) -> list[tuple[str, str | None, dict[str, Any]]]:
+    """Names of the variants, their own presets if any, and their settings; a single nameless one if there are none."""
     if tables == [{}]:
-        return [("", {})]
+        return [("", None, {})]
     named = isinstance(tables, list) and all(isinstance(t, dict) and isinstance(t.get("name"), str) for t in tables)
     names = [table["name"] for table in tables] if named else []
     if not names or len(set(names)) < len(names) or not all(name.replace("_", "").isalnum() for name in names):
         raise UserError(f"{path}: every one of [[variants]] must have a name of its own, of letters, digits and _")
-    rest = [{key: value for key, value in table.items() if key != "name"} for table in tables]
-    return [(name, _settings(path, f"variants.{name}", table)) for name, table in zip(names, rest, strict=True)]
+    found = []
+    for name, table in zip(names, tables, strict=True):
+        own = _preset(path, table["preset"]) if "preset" in table else None
+        rest = {key: value for key, value in table.items() if key not in ("name", "preset")}
+        found.append((name, own, _settings(path, f"variants.{name}", rest)))
+    return found
 
 
 def _labels(point: dict[str, Any]) -> list[str]:

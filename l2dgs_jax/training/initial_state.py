@@ -21,7 +21,9 @@ DRIFT = 0.05  # standard deviation of the logarithms of the frames' gains from w
 
 
 def split_darkening(split: Split, config: Config) -> Darkening:
-    """How the frames are darker than `config.loss.exposure_level`."""
+    """How the frames are darker than `config.loss.exposure_level`; not at all where low light is not modelled."""
+    if config.model.decomposition == "none":
+        return Darkening(1.0, 1.0)
     tone = config.model.tone
     if tone == "auto":
         tone = recognise(split.images, split.valid)

@@ -44,6 +44,8 @@ def total(
     exposed = images.reflectance if cfg.exposure_of == "reflectance" else images.welllit
     illumination = images.illumination[..., None]
     b1, b2 = images.attenuation[..., :1], images.attenuation[..., 1:]
+    lambda4 = cfg.structure if cfg.structure_illumination is None else cfg.structure_illumination
+    beta2 = cfg.structure_beta if cfg.structure_beta_illumination is None else cfg.structure_beta_illumination
     terms: Terms = {
         "l1": (1.0, lambda: photometric_l1(images.lowlight, target, cfg.l1_on, eta, cfg.eps)),
         "ssim": (cfg.ssim, lambda: photometric_ssim(images.lowlight, target, eta, cfg.eps)),
@@ -52,13 +54,14 @@ def total(
             lambda: exposure(exposed, cfg.exposure_level, cfg.exposure_window, cfg.exposure_form),
         ),
         "amplification": (cfg.amplification, lambda: amplification(images.illumination)),
+        "reflectance_amplification": (cfg.reflectance_amplification, lambda: amplification(images.reflectance)),
         "structure_reflectance": (
             cfg.structure,
             lambda: structure(b1, images.reflectance, cfg.structure_beta, cfg.structure_gradient),
         ),
         "structure_illumination": (
-            cfg.structure,
-            lambda: structure(b2, illumination, cfg.structure_beta, cfg.structure_gradient),
+            lambda4,
+            lambda: structure(b2, illumination, beta2, cfg.structure_gradient),
         ),
         "depth": (
             cfg.depth,
@@ -154,9 +157,9 @@ def depth_smoothness(
     return smoothness(depth_x, image_x) + smoothness(depth_y, image_y)
 
 
-def amplification(illumination: Float[Array, "*B H W"]) -> Scalar:
-    """Signal amplification (Eq. 13): mean |1 - L_w|."""
-    return jnp.abs(1 - illumination).mean()
+def amplification(image: Float[Array, "*B"]) -> Scalar:
+    """Signal amplification (Eq. 13): mean |1 - L_w|, or of R_w in its place."""
+    return jnp.abs(1 - image).mean()
 
 
 def structure(

@@ -22,6 +22,7 @@ GAUSSIAN_GROUPS: dict[str, Any] = {
     "gate": "gate",
     "paths": "paths",
     "lifetimes": "lifetimes",
+    "color_rest": "illumination_rest",
 }
 
 

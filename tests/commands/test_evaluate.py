@@ -112,6 +112,14 @@ def test_lowlight_scores_are_scikit_images(result, rendered):
     np.testing.assert_allclose(result["mask_area"], rendered["masks"].mean())
 
 
+def test_a_scene_of_brightened_frames_has_no_low_light_score(run, result):
+    brightened = dataclasses.replace(run, config=dataclasses.replace(run.config, enhance="gamma"))
+    scores = evaluate(brightened)
+    assert result.keys() - scores.keys() == {"lowlight", "lowlight_gain", "lowlight_regions"}
+    assert scores["welllit"] == result["welllit"]
+    assert "low light" not in table(scores)
+
+
 def test_of_drifting_exposures_each_frame_is_scored_after_its_own_gain(run, result, rendered):
     assert result["lowlight_gain"] == "none"
     params = run.state.scene.params._replace(exposures=np.zeros((len(run.dataset.train.names), 3), np.float32))

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from l2dgs_jax.errors import UserError
 from l2dgs_jax.exporters.model_arrays import model_arrays
 
 PAGE = (Path(__file__).parents[2] / "docs" / "export.md").read_text()
@@ -44,6 +45,13 @@ def test_dead_gaussians_stay_behind(run):
     fewer = dataclasses.replace(run, state=run.state._replace(scene=some_dead))
     before, after = (model_arrays(which)["gaussians/means"] for which in (run, fewer))
     np.testing.assert_array_equal(np.delete(before, [0, 5], axis=0), after)
+
+
+@pytest.mark.parametrize("part", [{"decomposition": "none"}, {"ocd": False}, {"bafe": False}, {"unit_exponent": "b1"}])
+def test_what_the_program_does_not_render_is_not_exported(run, part):
+    config = dataclasses.replace(run.config, model=dataclasses.replace(run.config.model, **part))
+    with pytest.raises(UserError, match=f"model.{next(iter(part))} is"):
+        model_arrays(dataclasses.replace(run, config=config))
 
 
 @pytest.mark.slow

@@ -1,14 +1,18 @@
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.test_util import check_grads
 
+from l2dgs_jax.config import ModelConfig
 from l2dgs_jax.model.decomposition import clip_unit, decompose, power
 from l2dgs_jax.model.networks import apply_bafe
 from l2dgs_jax.types import BAFENet, Conv, GroupNorm
 
-decompose_jit = jax.jit(decompose)
+CFG = ModelConfig()
+decompose_jit = jax.jit(partial(decompose, cfg=CFG))
 
 
 def make_bafe(dtype=jnp.float64):
@@ -33,7 +37,7 @@ def gradients(features, bafe):
     """Of the sum of all images."""
 
     def objective(features, bafe):
-        return sum(image.sum() for image in decompose(features, bafe))
+        return sum(image.sum() for image in decompose(features, bafe, CFG))
 
     return jax.grad(objective, (0, 1))(features, bafe)
 
@@ -68,7 +72,7 @@ def test_the_low_light_image_is_never_brighter():
 
 def test_gradients_of_the_images():
     features, bafe = make_features(2, 4, 5), make_bafe()
-    check_grads(jax.jit(decompose), (features, bafe), 1, ("rev",), 1e-5, 1e-5, eps=1e-6)
+    check_grads(decompose_jit, (features, bafe), 1, ("rev",), 1e-5, 1e-5, eps=1e-6)
 
 
 def test_gradients_of_power():
@@ -134,3 +138,35 @@ def test_batches_are_independent_views():
         alone = decompose_jit(features[index], bafe)
         for a, b in zip(together, alone, strict=True):
             np.testing.assert_allclose(a[index], b, rtol=1e-9)
+
+
+def test_without_a_decomposition_both_images_are_the_blended_colour():
+    features = make_features(2, 4, 5, low=-0.5, high=1.5)
+    images = decompose(features, make_bafe(), ModelConfig(decomposition="none"))
+    for image in (images.welllit, images.lowlight):
+        np.testing.assert_array_equal(image, np.clip(features[..., 1:4], 0, 1))
+    assert (images.illumination == 1).all()
+    assert (images.attenuation == 1).all()
+
+
+@pytest.mark.parametrize(("name", "index"), [("b1", 0), ("b2", 1)])
+def test_an_exponent_of_1_leaves_its_factor_as_it_is(name, index):
+    features, bafe = make_features(2, 4, 5), make_bafe()
+    usual, images = decompose_jit(features, bafe), decompose(features, bafe, ModelConfig(unit_exponent=name))
+    kept, changed = images.attenuation[..., 1 - index], images.attenuation[..., index]
+    np.testing.assert_allclose(kept, usual.attenuation[..., 1 - index], rtol=1e-12)
+    assert (changed == 1).all()
+    light, color = images.illumination[..., None], images.reflectance
+    expected = color * light ** kept[..., None] if name == "b1" else light * color ** kept[..., None]
+    np.testing.assert_allclose(images.lowlight, expected, rtol=1e-9)
+
+
+def test_without_bafe_net_a_pixel_has_exponents_of_its_own():
+    """From its own b1 and b2 alone, larger for larger ones, in the range that BAFE-Net has."""
+    features, bafe, cfg = make_features(1, 4, 5, low=-9, high=9), make_bafe(), ModelConfig(bafe=False)
+    exponents = decompose(features, bafe, cfg).attenuation
+    assert ((exponents > 1) & (exponents < 10)).all()
+    order = np.argsort(features[..., 4].ravel())
+    assert (np.diff(exponents[..., 0].ravel()[order]) > 0).all()
+    alone = decompose(features[:, 1:2, 2:3], bafe, cfg).attenuation
+    np.testing.assert_array_equal(alone, exponents[:, 1:2, 2:3])

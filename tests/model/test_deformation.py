@@ -119,6 +119,28 @@ def test_illumination_is_equation_3(moving, active):
     assert (expected > 0).any()
 
 
+def test_without_ocd_net_an_instant_is_lit_like_any_other():
+    params, cameras = scene(), look(times=(0.2, 0.7))
+    still = cameras._replace(viewmat=cameras.viewmat[:1].repeat(2, 0))
+    lit = lambda **options: moved_at(params, cameras=still, **options).illumination
+    without = lit(cfg=dataclasses.replace(CFG, ocd=False), moving=True)
+    np.testing.assert_allclose(without, lit(moving=False), rtol=1e-12)
+    assert np.ptp(lit(moving=True), axis=0).max() > 1e-3
+
+
+@pytest.mark.parametrize("active", [0, 1, 2])
+def test_colours_without_a_decomposition_are_spherical_harmonics(active):
+    params, cameras = scene(), look()
+    rest = jnp.asarray(np.random.default_rng(5).normal(0, 0.3, (N, 3, 8)))
+    params = params._replace(gaussians=params.gaussians._replace(color_rest=rest))
+    actual = moved_at(params, cameras=cameras, moving=True, sh_degree_active=jnp.array(active)).reflectance
+    for view, pose in enumerate(np.asarray(cameras.viewmat)):
+        towards = np.asarray(params.gaussians.means) - np.linalg.inv(pose)[:3, 3]
+        basis = np.stack([plain_basis(d / np.linalg.norm(d)) for d in towards])[:, 1 : (active + 1) ** 2]
+        seen = params.gaussians.reflectance + (rest[..., : basis.shape[1]] * basis[:, None]).sum(-1)
+        np.testing.assert_allclose(actual[view], np.maximum(seen, 0), rtol=1e-9, atol=1e-12)
+
+
 def test_illumination_offset_and_floor():
     params = scene()
     dark = params._replace(gaussians=params.gaussians._replace(illumination_dc=jnp.full((N, 1), -50.0)))

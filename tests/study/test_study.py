@@ -7,7 +7,7 @@ import pytest
 from scenes import write_nerfies
 
 from l2dgs_jax import runs, sweep
-from l2dgs_jax.config import PRESETS
+from l2dgs_jax.config import PRESETS, overrides
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.runtime import command_line
 from l2dgs_jax.study import report, running
@@ -63,6 +63,15 @@ def test_members_are_all_combinations(study, tmp_path):
     assert first == [(0, 0.4, 1e-4), (0, 0.4, 1e-3), (0, 0.4, 1e-4)]
 
 
+def test_a_variant_can_have_a_preset_of_its_own(study):
+    variants = '[[variants]]\nname = "a"\n[[variants]]\nname = "b"\npreset = "4dgs"\nloss.ssim = 0.5'
+    text = f'scenes = ["demo"]\npreset = "demo"\n{variants}'
+    a, b = read(study(text)).plans
+    assert (a.variant, a.config, a.varied) == ("a", PRESETS["demo"], {"seed": 0})
+    assert (b.variant, b.varied) == ("b", {"seed": 0, "preset": "4dgs", "loss.ssim": 0.5})
+    assert b.config == overrides.replace(PRESETS["4dgs"], {"loss.ssim": 0.5})
+
+
 def test_scenes_alone_are_a_study(study):
     (plan,) = read(study('scenes = ["demo"]')).plans
     assert (plan.scene, plan.config, plan.varied) == ("demo", PRESETS["default"], {"seed": 0})
@@ -91,6 +100,7 @@ def test_scenes_alone_are_a_study(study):
         ('scenes = ["a"]\n[grid]\nloss.ssim = [1.0, "x"]', "loss.ssim"),
         ('scenes = ["a"]\n[[variants]]\nloss.ssim = 1.0', "name"),
         ('scenes = ["a"]\n[[variants]]\nname = "a/b"', "name"),
+        ('scenes = ["a"]\n[[variants]]\nname = "b"\npreset = "nice"', "nice"),
         ('scenes = ["a"]\n[[variants]]\nname = "x"\n[[variants]]\nname = "x"', "name"),
     ],
 )
@@ -130,6 +140,13 @@ def test_members_of_one_shape_are_one_group(scenes):
     assert [len(group) for group in groups] == [8, 8, 4, 4, 4, 4]
     a, b = (next(e.config for e in groups[0] if e.plan.scene.endswith(name)) for name in "ab")
     assert a.model.initial_exponents[0] != "auto" != b.model.initial_exponents[0]
+
+
+def test_members_that_brighten_their_frames_have_frames_of_their_own(scenes):
+    (scenes / "study.toml").write_text('scenes = ["a"]\npreset = "4dgs"\n[grid]\nenhance = ["none", "gamma"]')
+    (dark,), (bright,) = load_groups(read(scenes / "study.toml"))
+    assert bright.dataset.train.images.mean() > 1.5 * dark.dataset.train.images.mean()
+    np.testing.assert_array_equal(bright.dataset.test.images, dark.dataset.test.images)
 
 
 @pytest.mark.parametrize(

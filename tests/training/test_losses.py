@@ -260,6 +260,26 @@ def test_total_is_eq_15(cfg):
     close(value, sum(weight * term for weight, term in expected.values()))
 
 
+def test_the_structure_terms_have_weights_and_scales_of_their_own():
+    render, target = make_render(), uniform(20, V, H, W, 3)
+    images = jax.tree.map(np.asarray, render.images)
+    cfg = LossConfig(structure=0.3, structure_illumination=2.0, structure_beta=0.2, structure_beta_illumination=0.7)
+    only = dataclasses.replace(cfg, ssim=0.0, exposure=0.0, amplification=0.0, depth=0.0)
+    value, terms = losses.total(render, target, only, 0.8)
+    b1, b2 = images.attenuation[..., :1], images.attenuation[..., 1:]
+    close(terms["structure_reflectance"], expected_structure(b1, images.reflectance, 0.2, "components"))
+    close(terms["structure_illumination"], expected_structure(b2, images.illumination[..., None], 0.7, "components"))
+    close(value, terms["l1"] + 0.3 * terms["structure_reflectance"] + 2.0 * terms["structure_illumination"])
+
+
+def test_reflectance_is_amplified_as_illumination_is():
+    render, target = make_render(), uniform(20, V, H, W, 3)
+    plain, _ = losses.total(render, target, LossConfig(), 0.8)
+    value, terms = losses.total(render, target, LossConfig(reflectance_amplification=0.05), 0.8)
+    close(terms["reflectance_amplification"], np.mean(1 - np.asarray(render.images.reflectance)))
+    close(value, plain + 0.05 * terms["reflectance_amplification"])
+
+
 def test_terms_of_weight_zero_are_not_computed():
     off = dataclasses.replace(LossConfig(), ssim=0.0, exposure=0.0, amplification=0.0, structure=0.0, depth=0.0)
     render = make_render()

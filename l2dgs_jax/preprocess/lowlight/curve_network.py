@@ -5,8 +5,8 @@ with its curve reversed and a second branch that sees the exposure. How its auth
 losses here are ours. The width is free; 256 channels are the released network.
 """
 
-from collections.abc import Iterable, Iterator
-from typing import NamedTuple
+from collections.abc import Callable, Iterable, Iterator
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -22,6 +22,8 @@ EXPOSURE_WEIGHT, SPATIAL_WEIGHT, SMOOTHNESS_WEIGHT = 10.0, 1.0, 1000.0
 BLOCK = 4  # pixels that the spatial loss averages over, each way
 
 Scalar = Float[Array, ""]
+Net = TypeVar("Net")
+Batch = TypeVar("Batch", bound=tuple)
 
 
 class CurveNet(NamedTuple):
@@ -114,40 +116,46 @@ def spatial_loss(dark: Float[Array, "B H W"], lightness: Float[Array, "B H W"]) 
     """
     mean = lambda image: image.mean((1, 2), keepdims=True)
     scale = jax.lax.stop_gradient(mean(dark) / jnp.maximum(mean(lightness), 1e-6))
-    return _squared_steps(_block_means(dark - scale * lightness)[..., None])
+    return squared_steps(block_means(dark - scale * lightness)[..., None])
 
 
 def smoothness_loss(curves: Float[Array, "B H W R"]) -> Scalar:
     """Squared steps between neighbouring pixels, summed over the curves (Zero-DCE's total variation)."""
-    return curves.shape[-1] * _squared_steps(curves)
+    return curves.shape[-1] * squared_steps(curves)
 
 
 def train(
-    net: CurveNet, batches: Iterable[tuple[Float[Array, "B H W"], Float[Array, "B H W"]]], rate: optimizer.Schedule
-) -> Iterator[tuple[CurveNet, Scalar]]:
-    """One step of Adam for every batch of lightness and exposure maps; yields the network and the loss before it."""
+    net: Net, batches: Iterable[Batch], rate: optimizer.Schedule, objective: Callable[..., Scalar] = loss
+) -> Iterator[tuple[Net, Scalar]]:
+    """One step of Adam for every batch; yields the network and the loss before it.
+
+    Args:
+        net: parameters.
+        batches: what `objective` takes besides them; by default lightness and exposure maps.
+        rate: of learning.
+        objective: the loss.
+    """
     adam = optimizer.adam(jax.tree.map(lambda _: "net", net), {"net": rate}, 0.9, 0.999, 1e-8)
 
     @jax.jit
-    def step(
-        net: CurveNet, state: optimizer.AdamState, lightness: Float[Array, "B H W"], exposure: Float[Array, "B H W"]
-    ) -> tuple[CurveNet, optimizer.AdamState, Scalar]:
-        value, gradients = jax.value_and_grad(loss)(net, lightness, exposure)
+    def step(net: Net, state: optimizer.AdamState, batch: Batch) -> tuple[Net, optimizer.AdamState, Scalar]:
+        value, gradients = jax.value_and_grad(objective)(net, *batch)
         move, state = adam.update(gradients, state, net)
         return jax.tree.map(jnp.add, net, move), state, value
 
     state = adam.init(net)
-    for lightness, exposure in batches:
-        net, state, value = step(net, state, lightness, exposure)
+    for batch in batches:
+        net, state, value = step(net, state, batch)
         yield net, value
 
 
-def _squared_steps(image: Float[Array, "B H W R"]) -> Scalar:
+def squared_steps(image: Float[Array, "B H W R"]) -> Scalar:
     """Mean squared step to the neighbours, over both directions of x and of y."""
     return 2 * (jnp.square(jnp.diff(image, axis=1)).mean() + jnp.square(jnp.diff(image, axis=2)).mean())
 
 
-def _block_means(image: Float[Array, "B H W"]) -> Float[Array, "B h w"]:
+def block_means(image: Float[Array, "B H W"]) -> Float[Array, "B h w"]:
+    """Means of blocks of `BLOCK` x `BLOCK` pixels; those that the image cuts off are left out."""
     batch, height, width = image.shape
     rows, columns = height // BLOCK, width // BLOCK
     whole = image[:, : rows * BLOCK, : columns * BLOCK]

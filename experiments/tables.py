@@ -1,0 +1,114 @@
+"""What the scripts for the paper's tables share: a study that is run or gone on with, and its scores by region."""
+
+import dataclasses
+import json
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tyro
+
+from experiments.published import MEASURES, REGIONS, Cells
+from l2dgs_jax.config import overrides
+from l2dgs_jax.runtime import devices
+from l2dgs_jax.runtime.files import replacing, write_json
+from l2dgs_jax.study import report, running
+from l2dgs_jax.study.spec import Spec, read
+
+STUDIES = Path(__file__).parent / "studies"
+TITLES = {"psnr": "PSNR", "ssim": "SSIM", "lpips_alex": "LPIPS", "psnr_gain": "PSNR after gain"}
+# Steps and sizes of a smoke run; the number of steps is that of each stage that a member has.
+QUICK_STEPS = 3
+QUICK = {"model.plane_size": 8, "model.hidden": 8, "model.tracks": False, "inbetweens": 0.0, "density.stop": 0}
+
+
+@dataclass(frozen=True)
+class Options:
+    """Train what a table compares, and set it beside the paper's figures.
+
+    Attributes:
+        output: folder for the study and the table; the same command goes on where it was interrupted.
+        study: TOML file to run in place of the one in experiments/studies; the names of its variants are the rows.
+        scenes: folders of scenes in place of the study's.
+        quick: a few steps on the first scene, to see that all of it works; its scores mean nothing.
+    """
+
+    output: tyro.conf.Positional[Path]
+    study: Path | None = None
+    scenes: tuple[str, ...] = ()
+    quick: bool = False
+
+
+def trained(options: Options, study: str) -> list[dict[str, Any]]:
+    """The results of all members of a study, as `results.json` holds them.
+
+    Raises:
+        UserError: as `run_study`.
+    """
+    devices.one_per_core()
+    scenes = [scene if scene == "demo" else str(Path(scene).absolute()) for scene in options.scenes]
+    spec = read(options.study or STUDIES / study, scenes)
+    spec = _quick(spec) if options.quick else spec
+    running.run_study(spec, options.output, resume=(options.output / running.PLANS).exists())
+    return json.loads((options.output / report.JSON).read_text())["members"]
+
+
+def _quick(spec: Spec) -> Spec:
+    first = spec.plans[0]
+    plans = []
+    for plan in spec.plans:
+        if (plan.scene, plan.config.seed) == (first.scene, first.config.seed):
+            steps = {
+                name: min(overrides.read(plan.config, name), QUICK_STEPS) for name in ("coarse_steps", "fine_steps")
+            }
+            plans.append(dataclasses.replace(plan, config=overrides.replace(plan.config, QUICK | steps)))
+    return Spec(tuple(plans), spec.one_program)
+
+
+def means(scores: Iterable[Cells]) -> Cells:
+    """Means over members, each over those that have the region and the measure."""
+    found: dict[str, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
+    for cells in scores:
+        for region, measures in cells.items():
+            for measure, value in measures.items():
+                found[region][measure].append(value)
+    return {
+        region: {measure: float(np.mean(values)) for measure, values in measures.items()}
+        for region, measures in found.items()
+    }
+
+
+def table(rows: Sequence[tuple[str, Sequence[Cells]]], measures: Sequence[str] = MEASURES) -> str:
+    """Markdown with a column for each region and measure; of several figures, all but the first are in brackets."""
+    columns = [
+        (region, measure)
+        for region in REGIONS
+        for measure in measures
+        if any(measure in cells.get(region, {}) for _, parts in rows for cells in parts)
+    ]
+    lines = [["", *(f"{region} {TITLES[measure]}" for region, measure in columns)]]
+    lines.append(["---"] * len(lines[0]))
+    for name, parts in rows:
+        shown = []
+        for region, measure in columns:
+            own, *others = (_text(cells.get(region, {}).get(measure), measure) for cells in parts)
+            shown.append(own + "".join(f" ({other})" for other in others))
+        lines.append([name, *shown])
+    return "".join(f"| {' | '.join(cells)} |\n" for cells in lines)
+
+
+def _text(value: float | None, measure: str) -> str:
+    return "–" if value is None else f"{value:.{1 if 'psnr' in measure else 2}f}"
+
+
+def write(options: Options, name: str, content: Any, markdown: str) -> None:
+    """Leave a table's numbers in NAME.json and itself in NAME.md, and print it."""
+    if options.quick:
+        markdown = f"A smoke run of {QUICK_STEPS} steps a stage: its scores mean nothing.\n\n{markdown}"
+    write_json(options.output / f"{name}.json", {"quick": options.quick} | content)
+    with replacing(options.output / f"{name}.md") as temporary:
+        temporary.write_text(markdown)
+    print(markdown)

@@ -1,0 +1,115 @@
+"""The paper's tables: their studies can be read, their figures are the paper's, and results land in the right cells."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from scenes import write_nerfies
+
+from experiments import lowlight, published, table1, table3, tables
+from l2dgs_jax.config import PRESETS, overrides
+from l2dgs_jax.study import spec
+
+ROOT = Path(__file__).parents[2]
+BASE = PRESETS["paper"]
+
+
+@pytest.mark.parametrize("path", sorted(tables.STUDIES.glob("*.toml")), ids=lambda path: path.stem)
+def test_their_studies_can_be_read(path):
+    variants = {plan.variant for plan in spec.read(path).plans}
+    plans = spec.read(path, ["/elsewhere"]).plans
+    assert {plan.scene for plan in plans} == {"/elsewhere"}
+    assert {plan.variant for plan in plans} == variants
+
+
+def test_methods_of_table_1_take_equally_many_steps():
+    configs = {plan.variant: plan.config for plan in spec.read(tables.STUDIES / "table1.toml", ["/a"]).plans}
+    assert len({config.steps for config in configs.values()}) == 1
+    assert len({config.density for config in configs.values()}) == 1
+    assert {config.enhance for name, config in configs.items() if name.endswith("_4DGS")} == {
+        "gamma",
+        "clahe",
+        "zero-dce",
+    }
+
+
+def test_every_row_of_table_3_differs_from_the_whole_by_what_it_says():
+    plans = {plan.variant: plan.config for plan in spec.read(tables.STUDIES / "table3.toml", ["/a"]).plans}
+    assert list(plans) == list(published.TABLE3)
+    changed = {name: set(overrides.differences([plans["whole"], config])) for name, config in plans.items()}
+    assert changed.pop("whole") == set()
+    assert changed.pop("maximise_r_instead") == {"loss.amplification", "loss.reflectance_amplification"}
+    assert all(len(names) == 1 for names in changed.values())
+    assert len({*map(frozenset, changed.values())}) == len(changed) - 1, "B1 and B2 share a setting"
+
+
+@pytest.mark.parametrize("rows", [*published.TABLE1.values(), published.TABLE3])
+def test_regions_of_the_papers_figures_lie_on_both_sides_of_the_whole(rows):
+    """All but few: a figure in the wrong column would not."""
+    sides = []
+    for cells in rows.values():
+        dynamic, static, overall = (cells[region]["ssim"] for region in published.REGIONS)
+        sides.append(min(dynamic, static) - 0.01 <= overall <= max(dynamic, static) + 0.01)
+    assert all(sides)
+
+
+def member(scene, variant, seed, psnr):
+    regions = {region: {"psnr": psnr + k, "ssim": 0.5} for k, region in enumerate(published.REGIONS)}
+    scores = {"welllit": regions, "lowlight": regions["overall"], "lowlight_regions": regions | {"covisible": {}}}
+    return {"scene": f"/data/{scene}", "variant": variant, "varied": {"seed": seed}, "scores": scores}
+
+
+MEMBERS = [
+    member(scene, variant, seed, 10 * first + second + seed)
+    for first, scene in enumerate(("mochi", "mine"))
+    for second, variant in enumerate(("L2DGS", "without_ssim"))
+    for seed in (0, 2)
+]
+
+
+def rows_of(text):
+    lines = [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines() if line]
+    return {name: cells for name, *cells in lines}
+
+
+def test_table_1_has_each_scene_beside_the_papers():
+    mochi, mine = table1.markdown(table1.collect(MEMBERS)).split("## ")[1:]
+    rows = rows_of(mochi.partition("\n\n")[2])
+    assert rows["L2DGS"] == ["1.0", "0.50", "–", "2.0", "0.50", "–", "3.0", "0.50", "–"]
+    assert rows["paper: L2DGS"] == ["21.0", "0.78", "0.07", "16.1", "0.77", "0.09", "17.6", "0.77", "0.16"]
+    assert "paper" not in mine
+    assert rows_of(mine.partition("\n\n")[2])["without_ssim"] == ["12.0", "0.50", "13.0", "0.50", "14.0", "0.50"]
+
+
+def test_table_3_is_a_mean_over_scenes():
+    rows = rows_of(table3.markdown(table3.collect(MEMBERS)))
+    assert rows["without_ssim"][:3] == ["7.0 (14.1)", "0.50 (0.41)", "– (0.20)"]
+
+
+def test_low_light_ends_in_a_mean():
+    rows = rows_of(lowlight.markdown(lowlight.collect([m for m in MEMBERS if m["variant"] == "L2DGS"])))
+    assert rows["mochi"] == ["1.0", "0.50", "2.0", "0.50", "3.0", "0.50"]
+    assert rows["mean"][-2:] == ["8.0 (31.9)", "0.50 (0.94)"]
+
+
+@pytest.mark.slow
+def test_a_quick_table_goes_on_where_it_stands(tmp_path):
+    write_nerfies(tmp_path / "mochi", 10, 24, 18, num_points=40, truth=True)
+    study = tmp_path / "study.toml"
+    study.write_text('scenes = ["mochi", "no"]\n[[variants]]\nname = "a"\npreset = "enhance-4dgs"\nenhance = "gamma"\n')
+    command = [sys.executable, "-m", "experiments.table1", str(tmp_path / "out"), "--study", str(study), "--quick"]
+    environment = os.environ | {"L2DGS_JAX_CACHE": str(tmp_path / "cache"), "PYTHONWARNINGS": "ignore"}
+    printed = []
+    for _ in range(2):
+        ran = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=True)
+        assert (tmp_path / "out" / "table1.md").read_text() in ran.stdout
+        printed.append(ran.stdout.partition("A smoke run")[2])
+    assert printed[0] == printed[1] != ""
+    found = json.loads((tmp_path / "out" / "table1.json").read_text())
+    assert found["quick"]
+    assert found["scenes"]["mochi"]["a"].keys() == {"dynamic", "static", "overall"}
+    metrics = next((tmp_path / "out").glob("*mochi*")) / "metrics.jsonl"
+    assert len(metrics.read_text().splitlines()) == 1, "nothing was trained again"

@@ -1,0 +1,60 @@
+"""Frames brightened before training: brighter, in range, the held-out ones left alone; Zero-DCE by hand."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from tiny_training import make_dataset
+
+from l2dgs_jax.data.dataset import Source
+from l2dgs_jax.preprocess import enhancement, zero_dce
+from l2dgs_jax.preprocess.enhancement import enhanced
+
+
+@pytest.fixture
+def dataset():
+    return dataclasses.replace(make_dataset(), source=Source("tiny", 1, "auto", "auto", 4.0))
+
+
+@pytest.mark.parametrize("method", ["gamma", "clahe", "zero-dce"])
+def test_training_frames_are_brighter_and_the_others_as_they_were(dataset, method, monkeypatch):
+    monkeypatch.setattr(zero_dce, "STEPS", 3)
+    monkeypatch.setattr(zero_dce, "RATES", (1e-2, 1e-2))
+    bright = enhanced(dataset, method)
+    images = bright.train.images
+    assert images.dtype == dataset.train.images.dtype
+    assert images.shape == dataset.train.images.shape
+    assert images.min() >= 0
+    assert images.max() <= 1
+    assert images.mean() > 1.2 * dataset.train.images.mean()
+    assert bright.test is dataset.test
+    assert bright.source.settings["enhance"] == method
+    assert enhanced(dataset, "none") is dataset
+
+
+def test_a_gamma_is_one_exponent_that_brings_even_frames_to_mid_grey(dataset):
+    flat = dataclasses.replace(dataset.train, images=np.full_like(dataset.train.images, 0.05))
+    images = enhanced(dataclasses.replace(dataset, train=flat), "gamma").train.images
+    np.testing.assert_allclose(images, enhancement.LEVEL, rtol=2e-3)
+
+
+def test_zero_dce_has_the_parameters_and_the_curve_of_its_paper():
+    net = zero_dce.init(jax.random.key(0))
+    assert sum(leaf.size for leaf in jax.tree.leaves(net)) == 79_416
+    images = jnp.asarray(np.random.default_rng(0).uniform(0, 0.3, (1, 4, 5, 3)))
+    parameters = np.asarray(zero_dce.curves(net, images)).reshape(1, 4, 5, 3, 8)
+    expected = np.asarray(images)
+    for n in range(8):  # LE_n = LE_{n-1} + A_n LE_{n-1} (1 - LE_{n-1})
+        expected = expected + parameters[..., n] * expected * (1 - expected)
+    np.testing.assert_allclose(zero_dce.brighten(net, images), expected, rtol=1e-12)
+
+
+def test_zero_dces_objective_by_hand():
+    """With all parameters 0 the picture stays as it is, and only exposure and tint count."""
+    net = jax.tree.map(jnp.zeros_like, zero_dce.init(jax.random.key(0)))
+    images = jnp.broadcast_to(jnp.asarray([0.1, 0.2, 0.4]), (2, 16, 16, 3))
+    tint = 0.1**2 + 0.2**2 + 0.3**2
+    expected = 10 * (0.7 / 3 - 0.6) ** 2 + 5 * tint
+    np.testing.assert_allclose(zero_dce.loss(net, images), expected, rtol=1e-12)
