@@ -8,8 +8,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from l2dgs_jax.cameras import select_camera
+from l2dgs_jax.data import Dataset
 from l2dgs_jax.data.images import to_bytes
-from l2dgs_jax.runs.run import Run
 from l2dgs_jax.types import RenderOutput
 from l2dgs_jax.viewer import ladder
 from l2dgs_jax.viewer.ladder import Size
@@ -49,7 +49,7 @@ class Guest:
     def __init__(
         self,
         client: Any,
-        run: Run,
+        dataset: Dataset,
         stage: Stage,
         renderers: Renderers,
         ranges: display.Ranges,
@@ -59,17 +59,17 @@ class Guest:
 
         Args:
             client: of viser.
-            run: what is shown.
-            stage: where it stands.
+            dataset: footage of what is shown.
+            stage: where that stands.
             renderers: what draws it.
             ranges: of the kinds of output that have colours only by their range.
             changed: called when the picture is out of date.
         """
-        self._client, self._run, self._stage, self._renderers, self._ranges = client, run, stage, renderers, ranges
-        self._changed = changed
+        self._client, self._dataset, self._stage = client, dataset, stage
+        self._renderers, self._ranges, self._changed = renderers, ranges, changed
         self._shown: Shown | None = None
         self._frusta: list[Any] = []
-        first = int(np.argmin(run.dataset.train.cameras.time))
+        first = int(np.argmin(dataset.train.cameras.time))
         self._panel = Panel(client.gui, changed)
         self._panel.home.on_click(lambda _: self._go(first))
         self._panel.frusta.on_update(lambda _: self._show_frusta())
@@ -95,8 +95,11 @@ class Guest:
 
     def _view(self) -> View:
         camera = self._client.camera
-        window = camera.image_width, camera.image_height
-        return View(tuple(camera.wxyz), tuple(camera.position), camera.fov, window, self._panel.instant())
+        return View(tuple(camera.wxyz), tuple(camera.position), camera.fov, self._window(), self._panel.instant())
+
+    def _window(self) -> Size:
+        camera = self._client.camera
+        return max(camera.image_width, 1), max(camera.image_height, 1)
 
     def _rendered(self, view: View, size: Size) -> Shown:
         wxyz, position, field, window, instant = view
@@ -113,15 +116,14 @@ class Guest:
         panel.status.content = f"{width} x {height}, {1000 * self._renderers.seconds[shown.size]:.0f} ms"
 
     def _moved(self) -> None:
-        camera = self._client.camera
-        self._renderers.order(ladder.ladder((camera.image_width, camera.image_height)))
+        self._renderers.order(ladder.ladder(self._window()))
         self._changed()
 
     def _go(self, index: int) -> None:
         """Stand where a trained view was filmed, at its instant."""
         camera = self._client.camera
-        trained = select_camera(self._run.dataset.train.cameras, index)
-        pose = self._stage.pose(trained, (camera.image_width, camera.image_height))
+        trained = select_camera(self._dataset.train.cameras, index)
+        pose = self._stage.pose(trained, self._window())
         with self._client.atomic():
             camera.up_direction = pose.up
             camera.position = pose.position
@@ -132,7 +134,7 @@ class Guest:
 
     def _show_frusta(self) -> None:
         if self._panel.frusta.value:
-            count = len(self._run.dataset.train.names)
+            count = len(self._dataset.train.names)
             chosen = np.unique(np.linspace(0, count - 1, min(count, FRUSTA)).round().astype(int))
             self._frusta = [self._frustum(int(index)) for index in chosen]
         else:
@@ -142,7 +144,7 @@ class Guest:
         self._changed()
 
     def _frustum(self, index: int) -> Any:
-        split, (width, height) = self._run.dataset.train, self._stage.frame
+        split, (width, height) = self._dataset.train, self._stage.frame
         camera = select_camera(split.cameras, index)
         pose = self._stage.pose(camera, self._stage.frame)
         thumbnail = (THUMBNAIL, round(height * THUMBNAIL / width))
@@ -151,6 +153,8 @@ class Guest:
             fov=pose.field,
             aspect=width / height,
             scale=FRUSTUM,
+            thickness=1.5,
+            thickness_units="screen",
             color=(255, 200, 90),
             image=cv2.resize(to_bytes(split.images[index]), thumbnail, interpolation=cv2.INTER_AREA),
             wxyz=np.roll(Rotation.from_matrix(np.asarray(camera.viewmat)[:3, :3].T).as_quat(), 1),

@@ -76,13 +76,15 @@ def serve(run: Run, host: str, port: int) -> Iterator[int]:
     server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
     server.scene.set_up_direction(mean_up(np.asarray(trained.viewmat)))
 
+    # Coroutines come and go in order; functions would run in threads.
     @server.on_client_connect
-    def _(client: Any) -> None:
+    async def _(client: Any) -> None:
         number = client.client_id
-        guests[number] = Guest(client, run, stage, renderers, ranges, lambda: turns.ask(number))
+        guests[number] = Guest(client, run.dataset, stage, renderers, ranges, lambda: turns.ask(number))
+        turns.ask(number)
 
     @server.on_client_disconnect
-    def _(client: Any) -> None:
+    async def _(client: Any) -> None:
         guests.pop(client.client_id, None)
         turns.leave(client.client_id)
 

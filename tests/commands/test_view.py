@@ -1,0 +1,89 @@
+"""The command that shows a run in the browser."""
+
+import shutil
+import signal
+import subprocess
+import sys
+
+import finished_run
+import numpy as np
+import pytest
+from browser import awaited, opened
+
+from l2dgs_jax.runtime import command_line
+from l2dgs_jax.view import main
+from l2dgs_jax.viewer.panel import NAMES
+
+PANEL = 340  # pixels at the right that controls cover
+
+
+def complaint(capsys, *arguments):
+    with pytest.raises(SystemExit) as end:
+        command_line.run(main, [*map(str, arguments)])
+    assert end.value.code == 2
+    return capsys.readouterr().err
+
+
+def test_mistakes_are_one_sentence(tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("L2DGS_JAX_CACHE", "off")
+    folder = finished_run.folder(tmp_path)
+    assert "--port 0: expected a number" in complaint(capsys, folder, "--port", 0)
+    assert "--host 192.0.2.1: " in complaint(capsys, folder, "--host", "192.0.2.1")
+    assert "not a training run" in complaint(capsys, tmp_path)
+    monkeypatch.setitem(sys.modules, "viser", None)
+    error = complaint(capsys, folder)
+    assert error == 'error: viser is not installed; expected the extra for viewing: pip install "l2dgs-jax[view]"\n'
+
+
+def changed(page, before):
+    """The picture once it is another and stands still."""
+    last = before
+
+    def settled():
+        nonlocal last
+        previous, last = last, page.picture()[:, :-PANEL].astype(int)
+        return bool((last != before).any() and (last == previous).all())
+
+    awaited(settled)
+    return last
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("chromium") is None, reason="needs Chromium")
+def test_a_browser_shows_what_its_controls_say(tmp_path):
+    command = [sys.executable, "-m", "l2dgs_jax.view", str(finished_run.folder(tmp_path)), "--port", "8917"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
+        try:
+            address = next(word for line in server.stdout for word in line.split() if word.startswith("http://127"))
+            with opened(address, tmp_path / "profile") as tab:
+                page = tab()
+                awaited(lambda: " ms" in page.says("document.body.innerText"))
+                first = changed(page, np.zeros(()))
+                page.enter("Brightness", "2")
+                bright = changed(page, first)
+                page.enter("Brightness", "0")
+                dark = changed(page, bright)
+                assert dark.mean() + 10 < first.mean() < bright.mean() - 10
+                page.enter("Brightness", "1")
+                page.enter("Instant", "1")
+                maps = [changed(page, dark)]
+                assert np.abs(maps[0] - first).mean() > 0.5
+                for name in list(NAMES)[1:]:
+                    page.choose("Show", name)
+                    maps.append(changed(page, maps[-1]))
+                assert len({shown.tobytes() for shown in maps}) == len(NAMES)
+
+                page.click("Filmed frames")
+                page.click("Play")
+                awaited(lambda: page.value("Instant") not in ("1", "0"))
+                page.wheel((200, 300), 500)
+                other = tab()
+                awaited(lambda: " ms" in other.says("document.body.innerText"))
+                assert [other.value(name) for name in ("Instant", "Brightness", "Show")] == ["0", "1", "well-lit"]
+                assert not page.complaints() + other.complaints()
+                place = address.removeprefix("http://").rstrip(";")
+                here = tuple(f"{scheme}{place}" for scheme in ("http://", "ws://", "blob:http://"))
+                assert all(url.startswith((*here, "data:")) for url in page.addresses() + other.addresses())
+        finally:
+            server.send_signal(signal.SIGINT)
+        assert server.wait(timeout=20) == 0
