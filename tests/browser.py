@@ -124,6 +124,10 @@ class Page:
         answer = self._call("Runtime.evaluate", expression=script, returnByValue=True)
         return answer["result"].get("value")
 
+    def text(self):
+        """All that can be read."""
+        return self.says("document.body?.innerText ?? ''")
+
     def value(self, name):
         """What a control shows."""
         return self.says(f"{self.CONTROL}({json.dumps(name)}).value")

@@ -1,6 +1,7 @@
 """The renderers of a run, one for every size, compiled before they are needed."""
 
 import math
+import sys
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -66,7 +67,10 @@ class Renderers:
                 self._background.submit(self._compile_and_tell, size)
 
     def _compile_and_tell(self, size: Size) -> None:
-        self.compile(size)
+        try:
+            self.compile(size)
+        except (MemoryError, jax.errors.JaxRuntimeError) as error:  # the smaller sizes remain
+            print(f"warning: no pictures of {size[0]}x{size[1]} pixels: {error}", file=sys.stderr)
         self._told()
 
     def compiled(self, sizes: Sequence[Size]) -> list[Size]:
