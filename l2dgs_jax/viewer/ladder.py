@@ -23,7 +23,7 @@ def ladder(window: Size) -> tuple[Size, ...]:
 
 
 def _side(square: float) -> int:
-    return 8 * round(math.sqrt(square) / 8)
+    return 4 * round(math.sqrt(square) / 4)
 
 
 def while_moving(sizes: Sequence[Size], seconds: Mapping[Size, float]) -> Size:

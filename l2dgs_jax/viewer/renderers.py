@@ -60,9 +60,9 @@ class Renderers:
         self.seconds[size] = taken
 
     def order(self, sizes: Sequence[Size]) -> None:
-        """Compile sizes in the background, in their order."""
+        """Compile sizes in the background, in their order; those that were too slow are tried again."""
         for size in sizes:
-            if size not in self._ordered:
+            if size not in self.seconds and size not in self._ordered:
                 self._ordered.add(size)
                 self._background.submit(self._compile_and_tell, size)
 
@@ -71,6 +71,7 @@ class Renderers:
             self.compile(size)
         except (MemoryError, jax.errors.JaxRuntimeError) as error:  # the smaller sizes remain
             print(f"warning: no pictures of {size[0]}x{size[1]} pixels: {error}", file=sys.stderr)
+        self._ordered.discard(size)
         self._told()
 
     def compiled(self, sizes: Sequence[Size]) -> list[Size]:

@@ -7,11 +7,13 @@ import subprocess
 import sys
 
 import finished_run
+import jax
 import numpy as np
 import pytest
 from browser import awaited, opened
 
 import l2dgs_jax
+from l2dgs_jax.model.networks import init_bafe
 from l2dgs_jax.runtime import command_line
 from l2dgs_jax.view import main
 from l2dgs_jax.viewer.panel import NAMES
@@ -37,13 +39,14 @@ def test_mistakes_are_one_sentence(tmp_path, capsys, monkeypatch):
     assert error == 'error: viser is not installed; expected the extra for viewing: pip install "l2dgs-jax[view]"\n'
 
 
-def moving_run(folder):
-    """A run in which time can be seen to pass."""
+def lively_run(folder):
+    """A run in which time can be seen to pass, and exponents to differ from place to place."""
     run = finished_run.opened(folder)
     scene = run.state.scene
     planes = scene.params.hexplane.time
-    rising = tuple(plane * np.linspace(0, 5, plane.shape[-3])[:, None, None].astype(plane.dtype) for plane in planes)
-    params = scene.params._replace(hexplane=scene.params.hexplane._replace(time=rising))
+    rising = tuple(plane * np.linspace(0, 5, len(plane[0]), dtype=plane.dtype)[None, :, None, None] for plane in planes)
+    bafe = jax.tree.map(lambda x: x.astype(planes[0].dtype), init_bafe(jax.random.key(0), None))
+    params = scene.params._replace(hexplane=scene.params.hexplane._replace(time=rising), bafe=bafe)
     state = run.state._replace(scene=scene._replace(params=params))
     return l2dgs_jax.save_run(dataclasses.replace(run, state=state), folder / "moving").folder
 
@@ -64,7 +67,7 @@ def changed(page, before):
 @pytest.mark.slow
 @pytest.mark.skipif(shutil.which("chromium") is None, reason="needs Chromium")
 def test_a_browser_shows_what_its_controls_say(tmp_path):
-    command = [sys.executable, "-m", "l2dgs_jax.view", str(moving_run(tmp_path)), "--port", "8917"]
+    command = [sys.executable, "-m", "l2dgs_jax.view", str(lively_run(tmp_path)), "--port", "8917"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
         try:
             address = next(word for line in server.stdout for word in line.split() if word.startswith("http://127"))

@@ -1,11 +1,14 @@
 """One browser: what it asks for and what it is shown."""
 
+from typing import get_args
+
 import numpy as np
 import pytest
 from fake_browser import Client
 from scenes import write_nerfies
 
 from l2dgs_jax.data import load_dataset
+from l2dgs_jax.runs.pictures import Output
 from l2dgs_jax.types import Decomposition, RenderOutput
 from l2dgs_jax.viewer import panel
 from l2dgs_jax.viewer.guest import FRUSTA, Guest
@@ -95,6 +98,7 @@ def test_each_output_is_another_picture(visit):
     for name in panel.NAMES:
         visit.gui["Show"].move(name)
         shown.append(visit.look())
+    assert set(panel.NAMES.values()) == set(get_args(Output))
     # In this scene L is R.
     different = {picture.tobytes() for picture in shown}
     assert len(different) == len(panel.NAMES) - 1

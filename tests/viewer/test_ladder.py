@@ -15,7 +15,7 @@ def test_sizes_grow_until_they_fill_the_window(window):
     sizes = ladder(window)
     pixels = [width * height for width, height in sizes]
     assert pixels == sorted(set(pixels))
-    assert all(side % 8 == 0 for size in sizes for side in size)
+    assert all(side % 4 == 0 for size in sizes for side in size)
     assert len(sizes) == len(STEPS) or pixels[-1] > 0.9 * math.prod(window)
     assert len(sizes) == 1 or STEPS[len(sizes) - 2] < math.prod(window)
 
