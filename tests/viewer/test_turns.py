@@ -1,6 +1,7 @@
 """Whose picture is drawn next."""
 
 import threading
+import time
 
 import pytest
 
@@ -91,7 +92,7 @@ def test_waiting_ends_with_a_wish_or_the_end():
     thread.start()
     turns.ask(7)
     while not taken:
-        pass
+        time.sleep(0.001)
     turns.close()
     thread.join(timeout=10)
     assert taken == [Turn(7, sharpen=False), None]
