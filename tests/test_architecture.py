@@ -22,10 +22,11 @@ FOLDERS = (
     "runs",
     "visualize",
     "exporters",
+    "viewer",
     "preprocess",
     "study",
 )
-COMMANDS = ("train", "evaluate", "render", "export", "sweep", "prepare", "convert", "masks", "simulate")
+COMMANDS = ("train", "evaluate", "render", "view", "export", "sweep", "prepare", "convert", "masks", "simulate")
 LAYERS = (*VOCABULARY, *FOLDERS, "commands")
 TOUCH_FILES = ("runtime", "data", "runs", "visualize", "preprocess", "study", "commands")
 MODULES = [path for path in PACKAGE.rglob("*.py") if path not in (PACKAGE / "__init__.py", PACKAGE / "__main__.py")]

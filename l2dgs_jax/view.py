@@ -1,0 +1,51 @@
+"""`python -m l2dgs_jax.view RUN`: fly through a run in the browser."""
+
+import contextlib
+import socket
+import threading
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from l2dgs_jax.errors import UserError
+from l2dgs_jax.runs import open_run
+from l2dgs_jax.runtime import command_line
+from l2dgs_jax.viewer import serve
+
+
+@dataclass(frozen=True)
+class View:
+    """Fly through a run in the browser, until Ctrl-C.
+
+    Attributes:
+        run: folder of the run.
+        host: address to listen at; 0.0.0.0 lets every machine of the network in.
+        port: to listen at, or the next that is free.
+        stage: the last checkpoint, or the one at the end of the coarse stage.
+    """
+
+    run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
+    host: str = "127.0.0.1"
+    port: int = 8080
+    stage: Literal["final", "coarse"] = "final"
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Serve as the command line says."""
+    options = command_line.parse(View, arguments, "view")
+    if not 1 <= options.port <= 65535:
+        raise UserError(f"--port {options.port}: expected a number from 1 to 65535")
+    run = open_run(options.run, options.stage)
+    print(f"preparing {options.run}", flush=True)
+    with serve(run, options.host, options.port) as port:
+        print(f"open http://{options.host}:{port} in a browser; Ctrl-C ends it")
+        print(f"from another machine: ssh -L {port}:{options.host}:{port} {socket.gethostname()}", flush=True)
+        with contextlib.suppress(KeyboardInterrupt):
+            threading.Event().wait()
+
+
+if __name__ == "__main__":
+    command_line.run(main, huge_pages=True)

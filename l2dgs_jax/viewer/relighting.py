@@ -1,0 +1,58 @@
+"""A decomposed view put together again in another light: what the low-light image is made by (Eq. 9), with a slider."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from l2dgs_jax.data.color import linear_to_srgb, srgb_to_linear
+from l2dgs_jax.model.decomposition import power
+from l2dgs_jax.types import Decomposition
+
+LUMINANCE: Float[np.ndarray, "3"] = np.array([0.2126, 0.7152, 0.0722])  # of linear red, green and blue (Rec. 709)
+WARMEST = 0.8  # stops between the gains of red and green, and of green and blue, at full warmth
+
+
+class Light(NamedTuple):
+    """How a view is lit. As it stands: the well-lit image.
+
+    Attributes:
+        brightness: 0 is as dark as filmed, 1 well-lit, and more is brighter still: the exponents of R and L are B1 and
+            B2 to the power of 1 - brightness.
+        shading: on the exponent of L; 0 is light that is the same everywhere.
+        gain: on linear light, stops.
+        warmth: from -1, blue, to 1, orange.
+        tint: from -1, green, to 1, magenta.
+    """
+
+    brightness: Any = 1.0
+    shading: Any = 1.0
+    gain: Any = 0.0
+    warmth: Any = 0.0
+    tint: Any = 0.0
+
+
+@jax.jit
+def relit(images: Decomposition, light: Light) -> Float[Array, "H W 3"]:
+    """(L^(shading B2^d) R^(B1^d)) with d = 1 - brightness, its white balanced and multiplied in linear light.
+
+    Args:
+        images: of a view.
+        light: how it is lit.
+
+    Returns:
+        sRGB values in [0, 1].
+    """
+    exponents = images.attenuation ** (1 - light.brightness)
+    illumination = power(images.illumination, light.shading * exponents[..., 1])
+    image = illumination[..., None] * power(images.reflectance, exponents[..., :1])
+    gains = white_balance(light.warmth, light.tint) * 2.0**light.gain
+    return linear_to_srgb(jnp.clip(srgb_to_linear(image) * gains[None, None].astype(image.dtype), 0, 1))
+
+
+def white_balance(warmth: Any, tint: Any) -> Float[Array, "3"]:
+    """Gains of linear red, green and blue that leave the luminance of grey as it is; see `Light`."""
+    gains = 2.0 ** (WARMEST * jnp.stack([warmth + tint / 2, -tint / 2, -warmth + tint / 2]))
+    return gains / (LUMINANCE * gains).sum()

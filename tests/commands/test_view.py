@@ -1,0 +1,105 @@
+"""The command that shows a run in the browser."""
+
+import dataclasses
+import shutil
+import signal
+import subprocess
+import sys
+
+import finished_run
+import jax
+import numpy as np
+import pytest
+from browser import awaited, opened
+
+import l2dgs_jax
+from l2dgs_jax.model.networks import init_bafe
+from l2dgs_jax.runtime import command_line
+from l2dgs_jax.view import main
+from l2dgs_jax.viewer.panel import NAMES
+
+PICTURE = np.s_[160:, :-340]  # above it viser may have something to say, beside it are the controls
+
+
+def complaint(capsys, *arguments):
+    with pytest.raises(SystemExit) as end:
+        command_line.run(main, [*map(str, arguments)])
+    assert end.value.code == 2
+    return capsys.readouterr().err
+
+
+def test_mistakes_are_one_sentence(tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("L2DGS_JAX_CACHE", "off")
+    folder = finished_run.folder(tmp_path)
+    assert "--port 0: expected a number" in complaint(capsys, folder, "--port", 0)
+    assert "--host 192.0.2.1: " in complaint(capsys, folder, "--host", "192.0.2.1")
+    assert "not a training run" in complaint(capsys, tmp_path)
+    monkeypatch.setitem(sys.modules, "viser", None)
+    error = complaint(capsys, folder)
+    assert error == 'error: viser is not installed; expected the extra for viewing: pip install "l2dgs-jax[view]"\n'
+
+
+def lively_run(folder):
+    """A run in which time can be seen to pass, and exponents to differ from place to place."""
+    run = finished_run.opened(folder)
+    scene = run.state.scene
+    planes = scene.params.hexplane.time
+    rising = tuple(plane * np.linspace(0, 5, len(plane[0]), dtype=plane.dtype)[None, :, None, None] for plane in planes)
+    bafe = jax.tree.map(lambda x: x.astype(planes[0].dtype), init_bafe(jax.random.key(0), None))
+    params = scene.params._replace(hexplane=scene.params.hexplane._replace(time=rising), bafe=bafe)
+    state = run.state._replace(scene=scene._replace(params=params))
+    return l2dgs_jax.save_run(dataclasses.replace(run, state=state), folder / "moving").folder
+
+
+def changed(page, before):
+    """The picture once it is another and stands still."""
+    last = before
+
+    def settled():
+        nonlocal last
+        previous, last = last, page.picture()[PICTURE].astype(int)
+        return bool((last != before).any() and (last == previous).all())
+
+    awaited(settled)
+    return last
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("chromium") is None, reason="needs Chromium")
+def test_a_browser_shows_what_its_controls_say(tmp_path):
+    command = [sys.executable, "-m", "l2dgs_jax.view", str(lively_run(tmp_path)), "--port", "8917"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
+        try:
+            address = next(word for line in server.stdout for word in line.split() if word.startswith("http://127"))
+            with opened(address, tmp_path / "profile") as tab:
+                page = tab()
+                awaited(lambda: " ms" in page.text())
+                first = changed(page, np.zeros(()))
+                page.enter("Instant", "1")
+                last = changed(page, first)
+                page.enter("Brightness", "2")
+                bright = changed(page, last)
+                page.enter("Brightness", "0")
+                dark = changed(page, bright)
+                assert dark.mean() + 10 < last.mean() < bright.mean() - 10
+                page.enter("Brightness", "1")
+                maps = [changed(page, dark)]
+                for name in list(NAMES)[1:]:
+                    page.choose("Show", name)
+                    maps.append(changed(page, maps[-1]))
+                assert len({shown.tobytes() for shown in maps}) == len(NAMES)
+
+                page.click("Filmed frames")
+                page.click("Play")
+                awaited(lambda: page.value("Instant") not in ("1", "0"))
+                page.wheel((200, 300), 500)
+                other = tab()
+                awaited(lambda: " ms" in other.text())
+                assert [other.value(name) for name in ("Instant", "Brightness", "Show")] == ["0", "1", "well-lit"]
+                assert not page.complaints() + other.complaints()
+                place = address.removeprefix("http://").rstrip(";")
+                here = tuple(f"{scheme}{place}" for scheme in ("http://", "ws://", "blob:http://"))
+                assert all(url.startswith((*here, "data:")) for url in page.addresses() + other.addresses())
+        finally:
+            server.send_signal(signal.SIGINT)
+        assert server.wait(timeout=20) == 0

@@ -1,0 +1,201 @@
+"""One browser: what it asks for and what it is shown."""
+
+from typing import get_args
+
+import numpy as np
+import pytest
+from fake_browser import Client
+from scenes import write_nerfies
+
+from l2dgs_jax.data import load_dataset
+from l2dgs_jax.runs.pictures import Output
+from l2dgs_jax.types import Decomposition, RenderOutput
+from l2dgs_jax.viewer import panel
+from l2dgs_jax.viewer.guest import FRUSTA, Guest
+from l2dgs_jax.viewer.ladder import MOVING, ladder
+from l2dgs_jax.viewer.renderers import Renderers
+from l2dgs_jax.viewer.stage import Stage
+
+WINDOW = 640, 360
+RANGES = {"b1": (1.0, 2.0), "b2": (5.0, 10.0), "depth": (0.0, 4.0)}
+
+
+class Pretended(Renderers):
+    """Renders a grey ramp, and remembers what it was asked for."""
+
+    def __init__(self, sizes):
+        self.seconds, self.asked, self.ordered = dict.fromkeys(sizes, 0.02), [], []
+
+    def order(self, sizes):
+        self.ordered = list(sizes)
+
+    def render(self, camera, size):
+        self.asked.append((camera, size))
+        width, height = size
+        grey = np.tile(np.linspace(0.1, 0.9, width), (height, 1))
+        colour = np.repeat(grey[..., None], 3, axis=-1)
+        dark, exponents = colour**4, np.stack([1.2 + 0 * grey, 8 + grey], axis=-1)
+        images = Decomposition(grey[..., None] * colour, dark, grey, colour, exponents)
+        return RenderOutput(images, 0 * grey + 1, 1 + grey, np.zeros(3), np.int32(1), np.bool_(False))
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    return load_dataset(write_nerfies(tmp_path_factory.mktemp("scene"), truth=True))
+
+
+@pytest.fixture
+def renderers():
+    return Pretended(ladder(WINDOW))
+
+
+class Visit:
+    def __init__(self, dataset, renderers):
+        stage = Stage.of(dataset.train.cameras, dataset.points, (dataset.width, dataset.height))
+        self.client, self.asked = Client(WINDOW), 0
+        self.guest = Guest(self.client, dataset, stage, renderers, RANGES, self._ask)
+        self.gui = self.client.gui
+
+    def _ask(self):
+        self.asked += 1
+
+    def look(self, sharpen=False):
+        self.more = self.guest.draw(sharpen)
+        return self.client.pictures[-1]
+
+
+@pytest.fixture
+def visit(dataset, renderers):
+    return Visit(dataset, renderers)
+
+
+def test_the_first_picture_is_the_first_trained_view(dataset, visit, renderers):
+    picture = visit.look()
+    camera, size = renderers.asked[-1]
+    assert picture.shape == (size[1], size[0], 3)
+    np.testing.assert_allclose(camera.time, dataset.train.cameras.time.min())
+    assert renderers.ordered == list(ladder(WINDOW))
+
+
+def test_only_camera_window_and_instant_take_a_rendering(visit, renderers):
+    visit.look()
+    for name, value in (("Brightness", 1.5), ("Curtain", 0.5), ("Show", "depth"), ("Gain", -1.0)):
+        asked = visit.asked
+        visit.gui[name].move(value)
+        assert visit.asked == asked + 1
+        visit.look()
+    assert len(renderers.asked) == 1
+    visit.gui["Instant"].move(0.5)
+    visit.look()
+    visit.client.fly([0.1, 0, 0])
+    visit.look()
+    assert len(renderers.asked) == 3
+    assert [float(camera.time) for camera, _ in renderers.asked[1:]] == [0.5, 0.5]
+
+
+def test_each_output_is_another_picture(visit):
+    shown = []
+    for name in panel.NAMES:
+        visit.gui["Show"].move(name)
+        shown.append(visit.look())
+    assert set(panel.NAMES.values()) == set(get_args(Output))
+    # In this scene L is R.
+    different = {picture.tobytes() for picture in shown}
+    assert len(different) == len(panel.NAMES) - 1
+
+
+def test_the_curtain_is_dark_on_its_left_only(visit):
+    lit = visit.look()
+    visit.gui["Show"].move("low-light")
+    dark = visit.look()
+    visit.gui["Show"].move("well-lit")
+    visit.gui["Curtain"].move(0.5)
+    both = visit.look()
+    middle = lit.shape[1] // 2
+    np.testing.assert_array_equal(both[:, : middle - 1], dark[:, : middle - 1])
+    np.testing.assert_array_equal(both[:, middle:], lit[:, middle:])
+
+
+def test_brightness_brightens_and_can_be_taken_back(visit):
+    before = visit.look()
+    visit.gui["Brightness"].move(1.6)
+    assert visit.look().mean() > before.mean() + 5
+    visit.gui["Well-lit again"].move(1)
+    np.testing.assert_array_equal(visit.look(), before)
+
+
+def test_small_pictures_while_moving_and_large_ones_when_still(visit, renderers):
+    smallest, largest = ladder(WINDOW)
+    renderers.seconds[largest] = 2 * MOVING
+    visit.look()
+    assert renderers.asked[-1][1] == smallest
+    assert visit.more
+    assert visit.look(sharpen=True).shape[1] == largest[0]
+    assert not visit.more
+    visit.gui["Warmth"].move(0.5)  # keeps the large one
+    assert visit.look().shape[1] == largest[0]
+    visit.client.fly([0.2, 0, 0])
+    assert visit.look().shape[1] == smallest[0]
+
+
+def test_a_size_that_is_not_compiled_is_not_waited_for(dataset, visit, renderers):
+    smallest, largest = ladder(WINDOW)
+    del renderers.seconds[largest]
+    visit.look()
+    assert not visit.more
+    visit.client.camera.image_width, visit.client.camera.image_height = 300, 600  # turned upright
+    visit.client.moved(None)
+    assert visit.look().shape[1::-1] == smallest
+    assert smallest not in renderers.ordered
+
+
+def test_every_browser_has_its_own_state(dataset, renderers):
+    one, other = Visit(dataset, renderers), Visit(dataset, renderers)
+    before = other.look()
+    one.gui["Instant"].move(0.8)
+    one.gui["Brightness"].move(0.0)
+    one.client.fly([0.3, 0, 0])
+    one.look()
+    np.testing.assert_array_equal(other.look(), before)
+    assert other.gui["Instant"].value < 0.5
+    assert len(renderers.asked) == 2
+
+
+def test_playing_asks_for_the_next_picture_and_moves_the_slider(visit, monkeypatch):
+    clock = [50.0]
+    monkeypatch.setattr("time.monotonic", lambda: clock[0])
+    visit.look()
+    visit.gui["Loop"].move(False)
+    visit.gui["Play"].move(True)
+    seen, start = [], visit.gui["Instant"].value
+    for _ in range(8):
+        clock[0] += 1.0
+        asked = visit.asked
+        visit.look()
+        seen.append(visit.gui["Instant"].value)
+        assert visit.asked == asked + visit.gui["Play"].value
+    assert seen[:2] == pytest.approx([start + 0.25, start + 0.5], abs=1e-3)
+    assert seen[-1] == 1
+    assert not visit.gui["Play"].value
+    visit.gui["Play"].move(True)  # from the beginning
+    clock[0] += 1.0
+    visit.look()
+    assert visit.gui["Instant"].value == 0.25
+
+
+def test_the_filmed_frames_come_go_and_lead_to_their_places(dataset, visit, renderers):
+    visit.look()
+    assert visit.client.depth is None
+    visit.gui["Filmed frames"].move(True)
+    names = dataset.train.names
+    assert len(visit.client.frusta) == min(FRUSTA, len(names))
+    visit.look()
+    assert visit.client.depth.shape == visit.client.pictures[-1].shape[:2]
+    visit.client.frusta[3].move(1)
+    visit.look()
+    camera = renderers.asked[-1][0]
+    np.testing.assert_allclose(camera.time, dataset.train.cameras.time[3], atol=1e-6)
+    visit.gui["Filmed frames"].move(False)
+    assert not visit.client.frusta
+    visit.look()
+    assert visit.client.depth is None
