@@ -48,6 +48,8 @@ def _presets() -> dict[str, Config]:
         inbetweens=0.3,
         model=ModelConfig(
             unit="depth",
+            motion_gate=True,
+            moving_share=0.3,
             tracks=True,
             hidden=64,
             plane_scales=(1, 2),
@@ -70,6 +72,7 @@ def _presets() -> dict[str, Config]:
             structure=0.1,
             illumination_tv=1.0,
             exponent_prior=0.2,
+            gate=0.03,
         ),
         optim=OptimConfig(
             extent_scales=("means", "paths"),  # motion field and heads have no unit

@@ -121,6 +121,10 @@ class ModelConfig:
     bafe: bool = True
     unit_exponent: Literal["b1", "b2"] | None = None  # the exponent that is 1 throughout (Table 3, B1 = 1 and B2 = 1)
 
+    def __post_init__(self) -> None:
+        if not 0 < self.moving_share <= 1:
+            raise UserError(f"--model.moving-share {self.moving_share}: expected more than 0 and at most 1")
+
 
 @dataclass(frozen=True)
 class LossConfig:

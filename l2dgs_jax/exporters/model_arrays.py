@@ -8,7 +8,7 @@ from jaxtyping import Shaped
 
 from l2dgs_jax.data.dataset import Split
 from l2dgs_jax.errors import UserError
-from l2dgs_jax.model.deformation import length_unit
+from l2dgs_jax.model.deformation import acting, length_unit
 from l2dgs_jax.rasterizer.projection import NEAR_PLANE
 from l2dgs_jax.runs import Run
 
@@ -27,6 +27,9 @@ def model_arrays(run: Run) -> dict[str, Shaped[np.ndarray, "..."]]:
             raise UserError(f"{run.name}: its model.{name} is {getattr(cfg, name)}; expected {whole} for a whole model")
     params, alive = scene.params, np.asarray(scene.alive)
     gaussians = {name: rows for name, rows in params.gaussians._asdict().items() if rows is not None}
+    moved = acting(scene, cfg)
+    if moved is not None:
+        gaussians["gate"] = np.where(moved.places < len(moved.rows), gaussians["gate"], -np.inf)
     coefficients = [gaussians.pop("illumination_dc"), gaussians.pop("illumination_rest")]
     gaussians["illumination"] = np.concatenate(coefficients, axis=-1)[:, : (run.renderer().sh_degree + 1) ** 2]
     unit = length_unit(scene.extent, cfg)

@@ -95,11 +95,7 @@ def _changes(
     chances: Float[Array, " N"] | None,
 ) -> _Changes:
     """What the motion field does to every Gaussian."""
-    gate, subset = gaussians.gate, None
-    if gate is not None and cfg.moving_share < 1:
-        scores = gate if chances is None else gate + chances
-        count = math.ceil(cfg.moving_share * len(gate))
-        subset = compaction.highest(jnp.where(scene.alive, scores, -jnp.inf), count)
+    gate, subset = gaussians.gate, acting(scene, cfg, chances)
     chosen = lambda rows: rows if subset is None else compaction.select(rows, subset, 0)
     # The same features feed the heads and OCD-Net: Eqs. 1 and 4 name them both f.
     field = hexplane.features(scene.params.hexplane, chosen(gaussians.means), scene.bounds, cameras.time, cfg)
@@ -109,6 +105,15 @@ def _changes(
         factor = jax.nn.sigmoid(chosen(gate))
         changes = jax.tree.map(lambda rows: factor.reshape(1, -1, *[1] * (rows.ndim - 2)) * rows, changes)
     return changes if subset is None else jax.tree.map(lambda rows: compaction.expand(rows, subset, 1), changes)
+
+
+def acting(scene: Scene, cfg: ModelConfig, chances: Float[Array, " N"] | None = None) -> compaction.Subset | None:
+    """The Gaussians that the motion field acts on; None for all. For `chances` see `deform`."""
+    gate = scene.params.gaussians.gate
+    if gate is None or cfg.moving_share == 1:
+        return None
+    scores = gate if chances is None else gate + chances
+    return compaction.highest(jnp.where(scene.alive, scores, -jnp.inf), math.ceil(cfg.moving_share * len(gate)))
 
 
 def _on_paths(

@@ -55,7 +55,9 @@ def test_what_the_program_does_not_render_is_not_exported(run, part):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("variant", [{}, {"aggregation": "product", "box_rim": 0.2}, {"background": 0.7}])
+@pytest.mark.parametrize(
+    "variant", [{}, {"aggregation": "product", "box_rim": 0.2}, {"background": 0.7, "moving_share": 0.4}]
+)
 def test_the_documented_program_renders_the_model(run, variant, tmp_path, monkeypatch):
     rng = np.random.default_rng(0)
     shake = lambda x: x + jnp.asarray(rng.normal(0, 0.3, x.shape), x.dtype)
