@@ -1,0 +1,48 @@
+// A camera that turns around a point. Axes are those of OpenCV: x to the right, y down, z forward.
+
+const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
+const along = (point, direction, length) => point.map((value, i) => value + length * direction[i]);
+
+const STEEPEST = 0.98; // cosine between where the camera looks and the vertical
+
+function rotated(vector, axis, angle) {
+  const aside = cross(axis, vector);
+  const [cosine, sine, up] = [Math.cos(angle), Math.sin(angle), dot(axis, vector) * (1 - Math.cos(angle))];
+  return vector.map((value, i) => value * cosine + aside[i] * sine + axis[i] * up);
+}
+
+class View {
+  // `camera` has a `viewmat` of three rows; `distance` is that of the point it turns around.
+  constructor(camera, up, distance) {
+    this.axes = camera.viewmat.map((row) => row.slice(0, 3));
+    const centre = [0, 1, 2].map((i) => -camera.viewmat.reduce((sum, row) => sum + row[i] * row[3], 0));
+    this.up = up;
+    this.distance = this.nearest = distance;
+    this.nearest *= 0.02;
+    this.target = along(centre, this.axes[2], distance);
+  }
+
+  get translation() {
+    const centre = along(this.target, this.axes[2], -this.distance);
+    return this.axes.map((axis) => -dot(axis, centre));
+  }
+
+  // Turn by angles in radians, as a hand that drags the scene to the right and downwards would turn it.
+  turn(right, down) {
+    const yawed = this.axes.map((axis) => rotated(axis, this.up, -right));
+    const turned = yawed.map((axis) => rotated(axis, yawed[0], -down));
+    const [before, after] = [this.axes, turned].map((axes) => Math.abs(dot(axes[2], this.up)));
+    this.axes = after < Math.max(STEEPEST, before) ? turned : yawed;
+  }
+
+  // Move with the scene under the hand, by parts of the distance.
+  move(right, down) {
+    this.target = along(this.target, this.axes[0], -right * this.distance);
+    this.target = along(this.target, this.axes[1], -down * this.distance);
+  }
+
+  approach(factor) {
+    this.distance = Math.max(this.distance / factor, this.nearest);
+  }
+}
