@@ -85,8 +85,8 @@ def closeness(run: Run, splats: Splats, time: float, image: Image = "welllit") -
     It is the mean over training cameras halfway between those that `bake` fits colours to.
     """
     cameras = _at_instant(run, time, slice(1, None, 2))
-    *geometry, colors = (jnp.asarray(rows, float) for rows in splats)
-    shown, _ = _blend(colors, tuple(geometry), cameras, _canvas(run))
+    means, quats, scales, opacities, colors = (jnp.asarray(rows, float) for rows in splats)
+    shown, _ = _blend(colors, (means, quats, scales, opacities), cameras, _canvas(run))
     return float(psnr(shown, _exact(run.renderer(), cameras, (image,))).mean())
 
 

@@ -82,7 +82,7 @@ def quantise(instants: Sequence[tuple[Splats, ...]], pixels: Float[np.ndarray, "
 
     order = np.argsort(~still, kind="stable")
     colors = (np.stack([splats[image].colors for splats in instants]) for image in range(len(instants[0])))
-    integers = (np.rint(255 * _unit(hold(x)[:, order], 0, brightest)).astype(np.uint8) for x in colors)
+    integers = (np.rint(255 * _unit(hold(x)[:, order], 0.0, brightest)).astype(np.uint8) for x in colors)
     return Tracks(geometry(still, True), geometry(~still, False), tuple(integers), box, ends, brightest)
 
 
@@ -126,7 +126,10 @@ def _planes(rows: Shaped[np.ndarray, "K N C"]) -> bytes:
 
 
 def _held(seen: Bool[np.ndarray, "K N"]) -> Int[np.ndarray, "K N"]:
-    """Which key instant to take values from: the last one in or beside which a Gaussian is seen; what does not change costs nothing."""
+    """Which key instant to take values from: the last one at or beside which a Gaussian is seen.
+
+    What nobody sees then changes nothing, and takes hardly any bytes.
+    """
     padded = np.pad(seen, ((1, 1), (0, 0)))
     needed = padded[:-2] | padded[1:-1] | padded[2:]
     return np.maximum.accumulate(np.where(needed, np.arange(len(seen))[:, None], 0), axis=0)

@@ -28,9 +28,10 @@ IMAGES: tuple[Image, ...] = ("welllit", "lowlight")
 CHECKS = 5  # instants at which a page is compared with the exact images
 DEPTH_CAMERAS = 16  # training cameras that tell how near Gaussians come
 SUMMARY = "The well-lit scene as it moves, reconstructed from a dark video by l2dgs_jax."
-INFORMATION = """<p>{count:,} Gaussians at {keys} key instants; {still:,} of them keep still. What the model blends twice,
-as illumination and reflectance, is one fitted colour here, and what lies between key instants is interpolated.</p>
-<p>Closeness to the exact images, at {checks} instants between and from training views: {scores}.</p>"""
+INFORMATION = """<p>{count:,} Gaussians, {still:,} of which keep still, at {keys} key instants. Here a Gaussian has one
+colour, the same from everywhere, where the model blends illumination and reflectance apart; and between key instants
+all is interpolated. This close come the images to those of the model, at {checks} instants halfway between key
+instants: {scores}.</p>"""
 
 
 def pixel_sizes(cameras: Camera, instants: list[tuple[Splats, ...]], nearest: float) -> Float[np.ndarray, " N"]:
@@ -51,7 +52,7 @@ def pixel_sizes(cameras: Camera, instants: list[tuple[Splats, ...]], nearest: fl
 
 
 def compare(run: Run, tracks: Tracks) -> Float[np.ndarray, "T I"]:
-    """PSNR of what a page shows of each image against the exact ones, dB, halfway between some pairs of key instants."""
+    """PSNR of what a page shows of each image against the exact ones, dB, halfway between some of the key instants."""
     spans = len(tracks.moving.positions) - 1
     times = (np.unique(np.linspace(0, spans - 1, CHECKS).round()) + 0.5) / spans
     shown = ((time, tracks_of.at(tracks, time)) for time in times.tolist())

@@ -1,5 +1,6 @@
 // The page: what it shows, when, and the controls around it.
 
+const LARGEST_CUT = 2; // a side of the picture over the part of it that a canvas of another shape shows
 const MOST_PIXELS = 2; // of the canvas to a CSS pixel
 const element = (id) => document.getElementById(id);
 
@@ -43,11 +44,13 @@ class Player {
     return this.scene.cameras.reduce((best, camera) => (apart(camera) < apart(best) ? camera : best));
   }
 
-  // That camera's lens with the size of the canvas: enlarged until the picture fills it.
+  // The lens of the camera last reset to, with the size of the canvas: enlarged until the picture fills it, unless more
+  // would be cut off than is left.
   lens() {
     const { width, height, dilation } = this.scene;
     const size = [this.canvas.width, this.canvas.height];
-    const scale = Math.max(size[0] / width, size[1] / height);
+    const fits = [size[0] / width, size[1] / height];
+    const scale = Math.min(Math.max(...fits), LARGEST_CUT * Math.min(...fits));
     const { focal, principal } = this.framed;
     return {
       focal: focal.map((pixels) => scale * pixels),
@@ -94,6 +97,7 @@ class Player {
   }
 
   schedule() {
+    this.canvas.ariaBusy = "true";
     if (this.scheduled) return;
     this.scheduled = true;
     requestAnimationFrame((now) => this.frame(now));
@@ -109,6 +113,7 @@ class Player {
     if (!this.sorted) return;
     this.renderer.draw(this.view, this.lens(), instant, this.image);
     this.ondraw?.();
+    if (!this.scheduled && !this.sorting) this.canvas.ariaBusy = "false";
   }
 
   advance(now) {
