@@ -91,7 +91,7 @@ def shown(run, tmp_path_factory):
     sizes = web_page.pixel_sizes(run.dataset.train.cameras, instants, near_plane(run))
     made = tracks.quantise(instants, sizes, OVERBRIGHT)
     path = tmp_path_factory.mktemp("page") / "scene.html"
-    path.write_text(web_page.page(run, made, web_page.compare(run, made), SECONDS), "utf-8")
+    path.write_text(web_page.page(run, made, np.full((1, 2), 30.0), SECONDS), "utf-8")
     return made, path
 
 
@@ -173,12 +173,9 @@ def test_the_page_shows_what_the_model_renders(run, visit):
 def test_controls_change_the_picture_and_reset_brings_it_back(visit):
     page = visit()
     page.says("document.getElementById('reset').click()")
-    pictures = [picture(page)]
-    differs = lambda: np.abs(picture(page) - pictures[0]).mean() > 0.003
-
-    def back():
-        page.press("r")
-        np.testing.assert_allclose(picture(page), pictures[0], atol=0.02)
+    inside = np.s_[5:-5, 5:-5]  # of the ring that shows the focus
+    first = picture(page)[inside]
+    differs = lambda: np.abs(picture(page)[inside] - first).mean() > 0.003
 
     middle = (WIDTH // 2, HEIGHT // 2)
     gestures = {
@@ -193,7 +190,8 @@ def test_controls_change_the_picture_and_reset_brings_it_back(visit):
     for name, gesture in gestures.items():
         gesture()
         assert differs(), name
-        back()
+        page.press("r")
+        np.testing.assert_allclose(picture(page)[inside], first, atol=0.02)
     seek(page, 0.6)
     assert differs()
     page.press(" ")

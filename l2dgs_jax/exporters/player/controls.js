@@ -1,4 +1,4 @@
-// Mouse, touch and keys on the canvas.
+// Mouse and touch on the canvas, and keys unless another control has the focus.
 
 const RADIANS = 2.5; // that a drag over the shorter side of the canvas turns the view by
 const KEY_STEP = 0.06; // of the shorter side
@@ -46,7 +46,8 @@ function steer(canvas, getView, getFocal, changed) {
     },
     { passive: false },
   );
-  canvas.addEventListener("keydown", (event) => {
+  document.addEventListener("keydown", (event) => {
+    if (![canvas, document.body].includes(event.target)) return;
     const arrow = ARROWS[event.key];
     if (arrow) {
       const [x, y] = arrow.map((direction) => direction * KEY_STEP * shorter());

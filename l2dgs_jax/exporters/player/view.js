@@ -5,6 +5,7 @@ const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a
 const along = (point, direction, length) => point.map((value, i) => value + length * direction[i]);
 
 const STEEPEST = 0.98; // cosine between where the camera looks and the vertical
+const NEAREST = 0.02; // distance from the point that it turns around, over the first one
 
 function rotated(vector, axis, angle) {
   const aside = cross(axis, vector);
@@ -18,8 +19,8 @@ class View {
     this.axes = camera.viewmat.map((row) => row.slice(0, 3));
     const centre = [0, 1, 2].map((i) => -camera.viewmat.reduce((sum, row) => sum + row[i] * row[3], 0));
     this.up = up;
-    this.distance = this.nearest = distance;
-    this.nearest *= 0.02;
+    this.distance = distance;
+    this.nearest = NEAREST * distance;
     this.target = along(centre, this.axes[2], distance);
   }
 
