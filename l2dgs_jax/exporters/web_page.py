@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from l2dgs_jax.cameras import camera_centres, median_depth
 from l2dgs_jax.cameras.geometry import mean_up
-from l2dgs_jax.cameras.paths import centre_of_attention
+from l2dgs_jax.cameras.paths import centre_of_attention, is_path
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.exporters import tracks as tracks_of
 from l2dgs_jax.exporters.baking import Image, background, closeness, near_plane
@@ -113,7 +113,8 @@ def _description(run: Run, tracks: Tracks, seconds: float) -> dict[str, Any]:
     except ValueError:
         raise UserError(f"{run.name}: no Gaussian is in front of a training camera; expected a trained scene") from None
     viewmats = np.asarray(cameras.viewmat, np.float64)
-    distances = ((centre_of_attention(cameras, depth) - camera_centres(viewmats)) * viewmats[:, 2, :3]).sum(-1)
+    centres = camera_centres(viewmats)
+    distances = ((centre_of_attention(cameras, depth) - centres) * viewmats[:, 2, :3]).sum(-1)
     return {
         "keys": len(tracks.moving.positions),
         "still": tracks.still.positions.shape[1],
@@ -132,10 +133,12 @@ def _description(run: Run, tracks: Tracks, seconds: float) -> dict[str, Any]:
         "height": dataset.height,
         "seconds": seconds,
         "up": _rounded(mean_up(viewmats)),
+        "path": is_path(cameras),
         "cameras": [
             {
                 "time": _rounded(cameras.time[i]),
-                "viewmat": _rounded(viewmats[i, :3]),
+                "axes": _rounded(viewmats[i, :3, :3]),
+                "centre": _rounded(centres[i]),
                 "focal": _rounded(cameras.K[i, [0, 1], [0, 1]]),
                 "principal": _rounded(cameras.K[i, :2, 2]),
                 "distance": _rounded(max(distances[i], depth / 4)),

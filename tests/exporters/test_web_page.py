@@ -126,12 +126,11 @@ def seek(page, time):
 
 
 def stand_at(page, run, index):
-    """Go to a training camera at its instant, rounded as the slider does."""
+    """Go to a training camera at its instant."""
     camera = run.dataset.train.camera(index)
-    time = round(float(camera.time), 3)
-    seek(page, time)
+    seek(page, float(camera.time))
     page.says("document.getElementById('reset').click()")
-    return camera._replace(time=np.float32(time))
+    return camera
 
 
 @pytest.mark.slow

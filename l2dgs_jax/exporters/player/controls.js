@@ -47,6 +47,7 @@ function steer(canvas, getView, getFocal, changed) {
     { passive: false },
   );
   document.addEventListener("keydown", (event) => {
+    if (event.ctrlKey || event.metaKey || event.altKey) return;
     if (![canvas, document.body].includes(event.target)) return;
     const arrow = ARROWS[event.key];
     if (arrow) {

@@ -34,24 +34,21 @@ class Player {
       canvas,
       () => this.view,
       () => (this.lens().focal[0] * canvas.clientWidth) / canvas.width,
-      () => this.changed(),
+      () => {
+        this.following = false;
+        this.changed();
+      },
     );
   }
 
-  // The training camera whose instant is nearest.
-  get camera() {
-    const apart = (camera) => Math.abs(camera.time - this.time);
-    return this.scene.cameras.reduce((best, camera) => (apart(camera) < apart(best) ? camera : best));
-  }
-
-  // The lens of the camera last reset to, with the size of the canvas: enlarged until the picture fills it, unless more
+  // The lens of the camera that the view started from, with the size of the canvas: enlarged until the picture fills it, unless more
   // would be cut off than is left.
   lens() {
     const { width, height, dilation } = this.scene;
     const size = [this.canvas.width, this.canvas.height];
     const fits = [size[0] / width, size[1] / height];
     const scale = Math.min(Math.max(...fits), LARGEST_CUT * Math.min(...fits));
-    const { focal, principal } = this.framed;
+    const { focal, principal } = this.camera;
     return {
       focal: focal.map((pixels) => scale * pixels),
       principal: [width, height].map((side, i) => size[i] / 2 + scale * (principal[i] - side / 2)),
@@ -60,9 +57,15 @@ class Player {
   }
 
   reset() {
-    this.framed = this.camera;
-    this.view = new View(this.framed, this.scene.up, this.framed.distance);
+    this.following = this.scene.path;
+    this.stand();
     this.changed();
+  }
+
+  // Where the camera stood that filmed this moment.
+  stand() {
+    this.camera = cameraAt(this.scene, this.time);
+    this.view = new View(this.camera, this.scene.up);
   }
 
   resize() {
@@ -79,6 +82,7 @@ class Player {
 
   seek(time) {
     this.time = Math.min(Math.max(time, 0), 1);
+    if (this.following) this.stand();
     this.changed();
     this.onseek?.();
   }

@@ -3,6 +3,7 @@
 const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
 const along = (point, direction, length) => point.map((value, i) => value + length * direction[i]);
+const unit = (a) => a.map((value) => value / Math.hypot(...a));
 
 const STEEPEST = 0.98; // cosine between where the camera looks and the vertical
 const NEAREST = 0.02; // distance from the point that it turns around, over the first one
@@ -13,15 +14,27 @@ function rotated(vector, axis, angle) {
   return vector.map((value, i) => value * cosine + aside[i] * sine + axis[i] * up);
 }
 
+// The camera that filmed an instant: between two training cameras; the nearest one if they are no path.
+function cameraAt({ cameras, path }, time) {
+  const next = cameras.findIndex((camera) => camera.time >= time);
+  if (next < 1) return cameras.at(next);
+  const [before, after] = [cameras[next - 1], cameras[next]];
+  const part = (time - before.time) / (after.time - before.time);
+  if (!path) return part < 0.5 ? before : after;
+  const between = (a, b) => (Array.isArray(a) ? a.map((value, i) => between(value, b[i])) : a + part * (b - a));
+  return Object.fromEntries(Object.keys(before).map((name) => [name, between(before[name], after[name])]));
+}
+
 class View {
-  // `camera` has a `viewmat` of three rows; `distance` is that of the point it turns around.
-  constructor(camera, up, distance) {
-    this.axes = camera.viewmat.map((row) => row.slice(0, 3));
-    const centre = [0, 1, 2].map((i) => -camera.viewmat.reduce((sum, row) => sum + row[i] * row[3], 0));
+  // `distance` of a camera is that of the point it turns around.
+  constructor({ axes, centre, distance }, up) {
+    const forward = unit(axes[2]);
+    const right = unit(cross(axes[1], forward));
+    this.axes = [right, cross(forward, right), forward];
     this.up = up;
     this.distance = distance;
     this.nearest = NEAREST * distance;
-    this.target = along(centre, this.axes[2], distance);
+    this.target = along(centre, forward, distance);
   }
 
   get translation() {
