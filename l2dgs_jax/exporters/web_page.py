@@ -55,10 +55,12 @@ def compare(run: Run, tracks: Tracks) -> Float[np.ndarray, "T I"]:
     """PSNR of what a page shows of each image against the exact ones, dB, halfway between some of the key instants."""
     spans = len(tracks.moving.positions) - 1
     times = (np.unique(np.linspace(0, spans - 1, CHECKS).round()) + 0.5) / spans
-    shown = ((time, tracks_of.at(tracks, time)) for time in times.tolist())
-    return np.array(
-        [[closeness(run, *pair) for pair in zip(splats, [time] * 2, IMAGES, strict=True)] for time, splats in shown]
-    )
+
+    def at_instant(time: float) -> list[float]:
+        shown = zip(tracks_of.at(tracks, time), IMAGES, strict=True)
+        return [closeness(run, splats, time, image) for splats, image in shown]
+
+    return np.array([at_instant(time) for time in times.tolist()])
 
 
 def page(run: Run, tracks: Tracks, scores: Float[np.ndarray, "T I"], seconds: float) -> str:

@@ -1,6 +1,6 @@
 // Mouse and touch on the canvas, and keys unless another control has the focus.
 
-const RADIANS = 2.5; // that a drag over the shorter side of the canvas turns the view by
+const RADIANS = 1.5; // that a drag over the shorter side of the canvas turns the view by
 const KEY_STEP = 0.06; // of the shorter side
 const ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
 
