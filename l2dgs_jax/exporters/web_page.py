@@ -30,8 +30,8 @@ DEPTH_CAMERAS = 16  # training cameras that tell how near Gaussians come
 SUMMARY = "The well-lit scene as it moves, reconstructed from a dark video by l2dgs_jax."
 INFORMATION = """<p>{count:,} Gaussians, {still:,} of which keep still, at {keys} key instants. Here a Gaussian has one
 colour, the same from everywhere, where the model blends illumination and reflectance apart; and between key instants
-all is interpolated. This close come the images to those of the model, at {checks} instants halfway between key
-instants: {scores}.</p>"""
+all is interpolated. Against the model's own images, halfway between key instants, those of this page have a PSNR of
+{scores}.</p>"""
 
 
 def pixel_sizes(cameras: Camera, instants: list[tuple[Splats, ...]], nearest: float) -> Float[np.ndarray, " N"]:
@@ -102,8 +102,7 @@ def _information(tracks: Tracks, scores: Float[np.ndarray, "T I"]) -> str:
         count=still + tracks.moving.positions.shape[1],
         keys=keys,
         still=still,
-        checks=len(scores),
-        scores="; ".join(f"{name} {mean:.1f} dB PSNR, at worst {least:.1f}" for name, mean, least in values),
+        scores=", and ".join(f"{mean:.1f} dB {name} (at worst {least:.1f})" for name, mean, least in values),
     )
 
 

@@ -65,7 +65,7 @@ def test_a_page_holds_everything_and_asks_for_nothing(run):
     elements = Elements(page)
     assert elements.text("title") == elements.text("h1") == "</script><b>A & B"
     assert "b" not in {tag for tag, _, _ in elements.found}
-    assert "well lit 31.0 dB PSNR, at worst 30.0; as filmed 41.0 dB PSNR, at worst 40.0" in page
+    assert "31.0 dB well lit (at worst 30.0), and 41.0 dB as filmed (at worst 40.0)" in page
     description = json.loads(elements.text("script", id="description"))
     assert description["seconds"] == SECONDS
     assert [camera["time"] for camera in description["cameras"]] == sorted(
