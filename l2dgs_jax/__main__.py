@@ -8,7 +8,7 @@ COMMANDS = {
     "evaluate": "score a run's held-out views",
     "render": "a run's views, or a flight through it, as pictures or videos",
     "view": "fly through a run in the browser",
-    "export": "a run's well-lit scene for viewers of splats",
+    "export": "a run's well-lit scene for viewers of splats, or as a web page",
     "sweep": "train a study of scenes, seeds and settings",
     "prepare": "poses and points for a video of one's own",
     "convert": "a scene in another program's layout",

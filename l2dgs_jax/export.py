@@ -12,11 +12,12 @@ from tqdm import tqdm
 
 from l2dgs_jax.cameras.geometry import mean_up
 from l2dgs_jax.errors import UserError
-from l2dgs_jax.exporters import antimatter15, gltf, ply
-from l2dgs_jax.exporters.baking import OVERBRIGHT, bake
+from l2dgs_jax.exporters import antimatter15, gltf, ply, web_page
+from l2dgs_jax.exporters.baking import OVERBRIGHT, bake, closeness, near_plane
 from l2dgs_jax.exporters.camera_path import camera_path
 from l2dgs_jax.exporters.model_arrays import model_arrays
 from l2dgs_jax.exporters.splats import Splats, visible
+from l2dgs_jax.exporters.tracks import quantise
 from l2dgs_jax.runs import Run, open_run
 from l2dgs_jax.runs.views import get_split
 from l2dgs_jax.runtime import command_line
@@ -27,10 +28,12 @@ FILES = {  # what is written if --output says nothing else
     "splat": "scene.splat",
     "gltf": "scene.glb",
     "cloud": "cloud.ply",
+    "html": "scene.html",
     "npz": "scene.npz",
     "cameras": "camera_path.json",
 }
-TIMELESS = ("npz", "cameras")
+TIMELESS = {"time": ("html", "npz", "cameras"), "times": ("npz", "cameras")}  # what does not take the option
+MOST_INSTANTS = 48  # of a page, unless more are asked for
 IN_BYTES = ("splat", "cloud")  # which is how they hold colours: nothing is brighter than white
 
 
@@ -43,18 +46,19 @@ class Export:
     Attributes:
         run: folder of the run.
         to: Gaussians as a "ply" of 3D Gaussian Splatting, a "splat" of antimatter15's viewer or a "gltf" with
-            KHR_gaussian_splatting; a point "cloud" (.ply); the whole model as arrays ("npz"); or the "cameras" of a
-            split as a path for nerfstudio.
+            KHR_gaussian_splatting; a point "cloud" (.ply); the moving scene as one page for browsers ("html"); the
+            whole model as arrays ("npz"); or the "cameras" of a split as a path for nerfstudio.
         output: file to write, or folder with --times; in RUN/exports if not given.
         time: instant to write, from 0 (first frame) to 1 (last frame); 0.5 if not given.
-        times: how many instants to write instead, spread evenly from 0 to 1: frame0001, frame0002 ... in a new folder.
+        times: how many instants to write instead, spread evenly from 0 to 1: frame0001, frame0002 ... in a new folder;
+            or between how many of them a page interpolates: as many as frames, but at most 48, if not given.
         split: whose cameras.
-        fps: frames a second of the path of cameras.
+        fps: frames a second of the path of cameras, and of the clip that a page plays.
         stage: the last checkpoint, or the one at the end of the coarse stage.
     """
 
     run: tyro.conf.Positional[Path]
-    to: Literal["ply", "splat", "gltf", "cloud", "npz", "cameras"]
+    to: Literal["ply", "splat", "gltf", "cloud", "html", "npz", "cameras"]
     output: Path | None = None
     time: float | None = None
     times: int | None = None
@@ -62,13 +66,18 @@ class Export:
     fps: int = 24
     stage: Literal["final", "coarse"] = "final"
 
+    @property
+    def sequence(self) -> bool:
+        """Whether there will be a folder of files."""
+        return self.times is not None and self.to != "html"
+
 
 def main(arguments: Sequence[str]) -> None:
     """Export as the command line says."""
     options = command_line.parse(Export, arguments, "export")
     _check(options)
     run = open_run(options.run, options.stage)
-    path = options.output or options.run / "exports" / (FILES[options.to] if options.times is None else options.to)
+    path = options.output or options.run / "exports" / (options.to if options.sequence else FILES[options.to])
     make_folder(path.parent)
     if options.to == "cameras":
         split = get_split(run, options.split)
@@ -79,6 +88,8 @@ def main(arguments: Sequence[str]) -> None:
         with replacing(path) as temporary:
             np.savez(temporary, **arrays)  # type: ignore[arg-type]
         print(f"wrote {len(arrays)} arrays to {path}")
+    elif options.to == "html":
+        _write_page(run, options, path)
     else:
         _write_splats(run, options, path)
 
@@ -87,8 +98,8 @@ def _check(options: Export) -> None:
     """Complain of options that are out of range or do not go together, before anything is read."""
     instants = {name: value for name, value in (("time", options.time), ("times", options.times)) if value is not None}
     for name, value in instants.items():
-        if options.to in TIMELESS:
-            others = ", ".join(to for to in FILES if to not in TIMELESS)
+        if options.to in TIMELESS[name]:
+            others = ", ".join(to for to in FILES if to not in TIMELESS[name])
             raise UserError(f"--{name} {value}: {options.to} covers all instants; expected it with one of {others}")
     if len(instants) == 2:
         raise UserError(f"--times {options.times}: given beside --time {options.time}; expected one of the two")
@@ -97,8 +108,10 @@ def _check(options: Export) -> None:
     for name, count in (("times", options.times), ("fps", options.fps)):
         if count is not None and count < 1:
             raise UserError(f"--{name} {count}: expected a whole number from 1")
+    if options.to == "html" and options.times == 1:
+        raise UserError("--times 1: html interpolates between instants; expected at least 2")
     suffix = Path(FILES[options.to]).suffix
-    if options.output and options.times is None and options.output.suffix != suffix:
+    if options.output and not options.sequence and options.output.suffix != suffix:
         raise UserError(f"--output {options.output}: expected a file name that ends in {suffix}")
 
 
@@ -110,27 +123,44 @@ def _write_splats(run: Run, options: Export, path: Path) -> None:
         "gltf": partial(gltf.encode, up=mean_up(np.asarray(run.dataset.train.cameras.viewmat))),
         "cloud": ply.encode_cloud,
     }
-    sequence = options.times is not None
     middle = 0.5 if options.time is None else options.time
     times = np.linspace(0, 1, options.times).tolist() if options.times else [middle]
     brightest = 1.0 if options.to in IN_BYTES else OVERBRIGHT
     counts, scores = [], []
-    with new_folder(path) if sequence else replacing(path) as target:
+    with new_folder(path) if options.sequence else replacing(path) as target:
         baked = bake(run, times, brightest)
         baked = tqdm(baked, total=len(times), desc="export", unit="instant", dynamic_ncols=True)
-        for number, (splats, score) in enumerate(baked, 1):
+        for number, (splats,) in enumerate(baked, 1):
             shown = visible(splats)
             if not len(shown.means):
                 raise UserError(f"{run.name}: nothing is visible at time {times[number - 1]}; expected a trained scene")
-            file = target / f"frame{number:04d}{Path(FILES[options.to]).suffix}" if sequence else target
+            file = target / f"frame{number:04d}{Path(FILES[options.to]).suffix}" if options.sequence else target
             file.write_bytes(encoders[options.to](shown))
             counts.append(len(shown.means))
-            scores.append(score)
-    files = f"{len(times)} files of " if sequence else ""
+            scores.append(closeness(run, splats, times[number - 1]))
+    files = f"{len(times)} files of " if options.sequence else ""
     total = len(splats.means)
     print(f"wrote {files}{_range(counts, 'd')} visible Gaussians, of {total} in all, to {path}")
     if options.to != "cloud":
         print(f"PSNR of their images against the exact well-lit images: {_range(scores, '.2f')} dB")
+
+
+def _write_page(run: Run, options: Export, path: Path) -> None:
+    """Bake key instants into one page."""
+    split = run.dataset.train
+    frames = len(split.names) + len(run.dataset.test.names)
+    count = options.times or min(max(frames, 2), MOST_INSTANTS)
+    with replacing(path) as temporary:
+        baked = bake(run, np.linspace(0, 1, count).tolist(), OVERBRIGHT, web_page.IMAGES)
+        instants = list(tqdm(baked, total=count, desc="export", unit="instant", dynamic_ncols=True))
+        if not any(len(visible(welllit).means) for welllit, _ in instants):
+            raise UserError(f"{run.name}: nothing is visible; expected a trained scene")
+        tracks = quantise(instants, web_page.pixel_sizes(split.cameras, instants, near_plane(run)), OVERBRIGHT)
+        scores = web_page.compare(run, tracks)
+        temporary.write_text(web_page.page(run, tracks, scores, frames / options.fps), "utf-8")
+    print(f"wrote {path}, {path.stat().st_size / 1e6:.1f} MB")
+    for image, of_image in zip(("well-lit", "low-light"), scores.T.tolist(), strict=True):
+        print(f"PSNR of its images against the exact {image} images: {_range(of_image, '.2f')} dB")
 
 
 def _range(values: Sequence[int] | Sequence[float], form: str) -> str:

@@ -163,6 +163,26 @@ class Page:
         x, y = position
         self._call("Input.dispatchMouseEvent", type="mouseWheel", x=x, y=y, deltaX=0, deltaY=distance)
 
+    def drag(self, start, end, modifiers=0):
+        """Press the mouse's left button at one point, let go of it at another; 8 is for the Shift key."""
+        for kind, (x, y) in (("mousePressed", start), ("mouseMoved", end), ("mouseReleased", end)):
+            arguments = {"type": kind, "x": x, "y": y, "modifiers": modifiers, "clickCount": 1}
+            self._call("Input.dispatchMouseEvent", **arguments, button="left", buttons=int(kind != "mouseReleased"))
+
+    def touch(self, *positions):
+        """Move each finger through its positions."""
+        kinds = ["touchStart", *["touchMove"] * (len(positions[0]) - 1)]
+        for kind, points in zip(kinds, zip(*positions, strict=True), strict=True):
+            points = [{"x": x, "y": y, "id": finger} for finger, (x, y) in enumerate(points)]
+            self._call("Input.dispatchTouchEvent", type=kind, touchPoints=points)
+        self._call("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
+
+    def press(self, key):
+        """Press a key where the focus is."""
+        text = {"text": key} if len(key) == 1 else {}
+        self._call("Input.dispatchKeyEvent", type="keyDown", key=key, **text)
+        self._call("Input.dispatchKeyEvent", type="keyUp", key=key)
+
     def picture(self):
         """A screenshot, RGB."""
         data = base64.b64decode(self._call("Page.captureScreenshot", format="png")["data"])

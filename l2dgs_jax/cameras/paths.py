@@ -45,9 +45,8 @@ def interpolate(cameras: Camera, times: Float[np.ndarray, " T"]) -> Camera:
     rotations = np.asarray(cameras.viewmat[:, :3, :3], np.float64)
     centres = camera_centres(np.asarray(cameras.viewmat, np.float64))
     intrinsics = np.asarray(cameras.K, np.float64)
-    bandwidth = max(0.04, 1.5 / len(trained))  # of the whole duration, and never less than a few views
-
-    if _rms(centres - _nearby(trained, trained, bandwidth) @ centres) > 0.5 * _rms(centres - centres.mean(0)):
+    bandwidth = _bandwidth(trained)
+    if not is_path(cameras):
         central = _most_central(centres)
         rotations, centres, intrinsics = (
             np.broadcast_to(x[central], x.shape) for x in (rotations, centres, intrinsics)
@@ -55,6 +54,14 @@ def interpolate(cameras: Camera, times: Float[np.ndarray, " T"]) -> Camera:
     weights = _nearby(times, trained, bandwidth)
     turned = np.stack([Rotation.from_matrix(rotations).mean(w).as_matrix() for w in weights])
     return _cameras(turned, weights @ centres, np.einsum("tf,fij->tij", weights, intrinsics), times, cameras)
+
+
+def is_path(cameras: Camera) -> bool:
+    """Whether views follow one another, and do not jump about from frame to frame."""
+    trained = np.asarray(cameras.time, np.float64)
+    centres = camera_centres(np.asarray(cameras.viewmat, np.float64))
+    aside = centres - _nearby(trained, trained, _bandwidth(trained)) @ centres
+    return _rms(aside) <= 0.5 * _rms(centres - centres.mean(0))
 
 
 def spiral(cameras: Camera, depth: float, times: Float[np.ndarray, " T"]) -> Camera:
@@ -156,6 +163,11 @@ def _cameras(
 def _most_central(centres: Float[np.ndarray, "F 3"]) -> int:
     """The one that is nearest to all others in the mean."""
     return int(cdist(centres, centres).sum(0).argmin())
+
+
+def _bandwidth(times: Float[np.ndarray, " F"]) -> float:
+    """Of the weights with which views are averaged: a part of the whole duration, and never less than a few views."""
+    return max(0.04, 1.5 / len(times))
 
 
 def _nearby(at: Float[np.ndarray, " A"], times: Float[np.ndarray, " F"], bandwidth: float) -> Float[np.ndarray, "A F"]:

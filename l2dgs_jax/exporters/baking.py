@@ -2,12 +2,13 @@
 
 The well-lit image is a product of two blended images (Eq. 7), and reflectances may lie outside [0, 1]; a viewer blends
 once, and takes no colours below 0. So the colours are those in a range whose blend comes closest to the exact images of
-some training cameras, in the sense of least squares: a convex problem, as a blend is linear in its colours.
+some training cameras, in the sense of least squares: a convex problem, as a blend is linear in its colours. Colours
+that show the estimates of the dark frames (Eq. 9) are fitted alike.
 """
 
 from collections.abc import Iterable, Iterator
 from functools import partial
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -32,19 +33,8 @@ FIRST_ROUNDS, ROUNDS = 24, 6  # of the fit, at the first instant and at others, 
 OVERBRIGHT = 1.25  # a brightest colour with which most of what [0, 1] costs is won back; more gains hardly anything
 LEAST_WEIGHT = 1e-9  # summed over all pixels; what is seen less keeps its colour
 
+Image = Literal["welllit", "lowlight"]
 Geometry = tuple[Float[Array, "N 3"], Float[Array, "N 4"], Float[Array, "N 3"], Float[Array, " N"]]
-
-
-class Baked(NamedTuple):
-    """A scene at an instant, and how close its colours come to L and R.
-
-    Attributes:
-        splats: every Gaussian of the scene, in the same order at all instants.
-        psnr: of their images against the exact ones, dB, mean over training cameras that they were not fitted to.
-    """
-
-    splats: Splats
-    psnr: float
 
 
 class _Canvas(NamedTuple):
@@ -56,8 +46,10 @@ class _Canvas(NamedTuple):
     background: float
 
 
-def bake(run: Run, times: Iterable[float], brightest: float = 1.0) -> Iterator[Baked]:
-    """The well-lit scene at each of some instants, one after the other.
+def bake(
+    run: Run, times: Iterable[float], brightest: float = 1.0, images: tuple[Image, ...] = ("welllit",)
+) -> Iterator[tuple[Splats, ...]]:
+    """The scene at each of some instants, one after the other: every Gaussian, in the same order at all of them.
 
     The colours are to be blended over black; over white if `model.background` is 1.
 
@@ -66,40 +58,50 @@ def bake(run: Run, times: Iterable[float], brightest: float = 1.0) -> Iterator[B
         times: instants in [0, 1], best in their order: each starts from the colours of the one before.
         brightest: upper end of the colours' range: 1, or somewhat more (`OVERBRIGHT`) where nothing clips them before
             they are blended.
+        images: which images the colours are to show, the well-lit ones first; each makes Gaussians of its own, which
+            differ in their colours only.
     """
-    scene, cfg, renderer, train = run.state.scene, run.config.model, run.renderer(), run.dataset.train
-    near_plane = float(NEAR_PLANE * length_unit(scene.extent, cfg))
-    canvas = _Canvas(run.dataset.width, run.dataset.height, near_plane, cfg.background**2)
-    views = np.unique(np.linspace(0, len(train.names) - 1, 2 * VIEWS - 1).round().astype(int))
-    between = views[1::2] if len(views) > 1 else views
+    scene, cfg, renderer, canvas = run.state.scene, run.config.model, run.renderer(), _canvas(run)
     colors, rounds = None, FIRST_ROUNDS
     for time in times:
-        fitted, checked = (_at_instant(train.cameras, chosen, time) for chosen in (views[::2], between))
-        moved = _moved(scene, fitted, renderer.sh_degree, cfg=cfg, moving=run.moving)
+        cameras = _at_instant(run, time, slice(0, None, 2))
+        moved = _moved(scene, cameras, renderer.sh_degree, cfg=cfg, moving=run.moving)
         geometry = tuple(rows[0] for rows in (moved.means, moved.quats, moved.scales, moved.opacities))
+        exact = _exact(renderer, cameras, images)
         if colors is None:
-            colors = jnp.clip(moved.illumination.mean(0)[:, None] * moved.reflectance[0], 0, brightest)
-        _, drawn = _blend(colors, geometry, fitted, canvas)
-        room, images = next_capacity(int(drawn.pairs)), _exact(renderer, fitted)
-        colors = _fit(colors, geometry, fitted, images, rounds, brightest, canvas=canvas, pair_capacity=room)
+            levels = exact.mean((0, 1, 2))
+            own = moved.illumination.mean(0)[:, None] * moved.reflectance[0]
+            colors = jnp.clip(jnp.tile(own, len(images)) * _gains(levels)[None], 0, brightest)
+        _, drawn = _blend(colors, geometry, cameras, canvas)
+        room = next_capacity(int(drawn.pairs))
+        colors = _fit(colors, geometry, cameras, exact, rounds, brightest, canvas=canvas, pair_capacity=room)
         rounds = ROUNDS
-        images, _ = _blend(colors, geometry, checked, canvas)
-        closeness = psnr(images, _exact(renderer, checked)).mean()
-        yield Baked(_splats(geometry, colors, np.asarray(scene.alive)), float(closeness))
+        yield _splats(geometry, colors, np.asarray(scene.alive))
+
+
+def closeness(run: Run, splats: Splats, time: float, image: Image = "welllit") -> float:
+    """PSNR of the images of Gaussians against the exact ones of an instant, dB.
+
+    It is the mean over training cameras halfway between those that `bake` fits colours to.
+    """
+    cameras = _at_instant(run, time, slice(1, None, 2))
+    means, quats, scales, opacities, colors = (jnp.asarray(rows, float) for rows in splats)
+    shown, _ = _blend(colors, (means, quats, scales, opacities), cameras, _canvas(run))
+    return float(psnr(shown, _exact(run.renderer(), cameras, (image,))).mean())
 
 
 @partial(jax.jit, static_argnames=("canvas", "pair_capacity"))
 def _fit(
-    colors: Float[Array, "N 3"],
+    colors: Float[Array, "N C"],
     geometry: Geometry,
     cameras: Camera,
-    images: Float[Array, "V H W 3"],
+    images: Float[Array, "V H W C"],
     rounds: Int[Array, ""] | int,
     brightest: Float[Array, ""] | float,
     *,
     canvas: _Canvas,
     pair_capacity: int,
-) -> Float[Array, "N 3"]:
+) -> Float[Array, "N C"]:
     """The colours from 0 to `brightest` whose images have the least squared error, by projected gradients (FISTA).
 
     The weights of a pixel's Gaussians sum to its alpha. With A of these weights, that makes the row sums of A^T A equal
@@ -120,12 +122,12 @@ def _fit(
 
 
 def _blend(
-    colors: Float[Array, "N 3"],
+    colors: Float[Array, "N C"],
     geometry: Geometry,
     cameras: Camera,
     canvas: _Canvas,
     pair_capacity: int | None = None,
-) -> tuple[Float[Array, "V H W 3"], RasterOutput]:
+) -> tuple[Float[Array, "V H W C"], RasterOutput]:
     """The images that a viewer of splats shows, and what else was drawn; gradients flow to the colours."""
     drawn = rasterize(
         *geometry,
@@ -147,20 +149,53 @@ def _moved(
     return deform(scene, cameras, cfg, moving=moving, sh_degree_active=sh_degree)
 
 
-def _exact(renderer: Renderer, cameras: Camera) -> Float[Array, "V H W 3"]:
-    """The well-lit images of Eq. 7."""
+def near_plane(run: Run) -> float:
+    """Depth from which on Gaussians are drawn, world units."""
+    return float(NEAR_PLANE * length_unit(run.state.scene.extent, run.config.model))
+
+
+def background(run: Run) -> float:
+    """What the colours are to be blended over, sRGB."""
+    return run.config.model.background**2
+
+
+def _exact(renderer: Renderer, cameras: Camera, kinds: tuple[Image, ...]) -> Float[Array, "V H W C"]:
+    """The images of Eqs. 7 and 9, their channels side by side."""
+
+    def draw(camera: Camera) -> Float[Array, "H W C"]:
+        if kinds == ("welllit",):
+            return renderer.welllit(camera)
+        images = renderer(camera).images
+        return jnp.concatenate([getattr(images, kind) for kind in kinds], axis=-1)
+
     views = range(len(cameras.time))
-    return jnp.stack(list(prefetch(lambda i: renderer.welllit(select_camera(cameras, i)), views)))
+    return jnp.stack(list(prefetch(lambda i: draw(select_camera(cameras, i)), views)))
 
 
-def _at_instant(cameras: Camera, chosen: Int[np.ndarray, " V"], time: float) -> Camera:
-    """Some of the cameras, all at one instant."""
+def _gains(levels: Float[Array, " C"]) -> Float[Array, " C"]:
+    """How bright images are on average, over the first of them."""
+    means = levels.reshape(-1, 3).mean(-1)
+    return jnp.repeat(means / jnp.maximum(means[:1], LEAST_WEIGHT), 3)
+
+
+def _canvas(run: Run) -> _Canvas:
+    return _Canvas(run.dataset.width, run.dataset.height, near_plane(run), background(run))
+
+
+def _at_instant(run: Run, time: float, every_other: slice) -> Camera:
+    """Training cameras spread over all of them, those for the fit or those between, at one instant."""
+    cameras = run.dataset.train.cameras
+    spread = np.unique(np.linspace(0, len(cameras.time) - 1, 2 * VIEWS - 1).round().astype(int))
+    chosen = spread[every_other] if len(spread) > 1 else spread
     viewmat, K = (jnp.asarray(x[chosen], float) for x in (cameras.viewmat, cameras.K))
     return Camera(viewmat, K, jnp.full(len(chosen), time, float))
 
 
-def _splats(geometry: Geometry, colors: Float[Array, "N 3"], alive: Bool[np.ndarray, " N"]) -> Splats:
-    splats = Splats(*(np.asarray(rows, np.float32)[alive] for rows in (*geometry, colors)))
-    norms = np.linalg.norm(splats.quats, axis=-1, keepdims=True)
+def _splats(geometry: Geometry, colors: Float[Array, "N C"], alive: Bool[np.ndarray, " N"]) -> tuple[Splats, ...]:
+    means, quats, scales, opacities, shown = (np.asarray(rows, np.float32)[alive] for rows in (*geometry, colors))
+    norms = np.linalg.norm(quats, axis=-1, keepdims=True)
     identity = np.array([[1, 0, 0, 0]], np.float32)
-    return splats._replace(quats=np.divide(splats.quats, norms, out=identity.repeat(len(norms), 0), where=norms > 0))
+    quats = np.divide(quats, norms, out=identity.repeat(len(norms), 0), where=norms > 0)
+    return tuple(
+        Splats(means, quats, scales, opacities, of_image) for of_image in np.split(shown, shown.shape[1] // 3, 1)
+    )

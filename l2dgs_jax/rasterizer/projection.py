@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float
 from l2dgs_jax.kernels.fusion import fusion_boundary
 
 NEAR_PLANE = 0.01  # world units
+EPS_2D = 0.3  # pixels^2
 FIELD_MARGIN = 0.3  # of half the field of view: how far outside the image the Jacobian still follows the centre
 
 
@@ -49,7 +50,7 @@ def project(
     width: int,
     height: int,
     near_plane: Float[Array, ""] | float = NEAR_PLANE,
-    eps2d: float = 0.3,
+    eps2d: float = EPS_2D,
 ) -> Projected:
     """Project Gaussians by a pinhole camera, to first order around their centres (EWA; 3DGS, arXiv 2308.04079).
 

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, Int
 from l2dgs_jax.kernels.blend import blend
 from l2dgs_jax.kernels.fusion import fusion_boundary
 from l2dgs_jax.kernels.tiles import TILE, grid
-from l2dgs_jax.rasterizer.projection import NEAR_PLANE, Projected, project
+from l2dgs_jax.rasterizer.projection import EPS_2D, NEAR_PLANE, Projected, project
 from l2dgs_jax.rasterizer.tile_lists import Footprints, footprints, intersect, pairs_needed
 from l2dgs_jax.types import RasterOutput
 
@@ -29,7 +29,7 @@ def rasterize(
     height: int,
     *,
     near_plane: Float[Array, ""] | float = NEAR_PLANE,
-    eps2d: float = 0.3,
+    eps2d: float = EPS_2D,
     depth_mode: Literal["accumulated", "expected"] = "accumulated",
     means2d_probe: Float[Array, "*V N 2"] | None = None,
     pair_capacity: int | None = None,
@@ -125,7 +125,7 @@ def count_pairs(
     height: int,
     *,
     near_plane: Float[Array, ""] | float = NEAR_PLANE,
-    eps2d: float = 0.3,
+    eps2d: float = EPS_2D,
     means2d_probe: Float[Array, "V N 2"] | None = None,
 ) -> Int[Array, ""]:
     """The `pair_capacity` that `rasterize` needs for the same arguments, at most 2^31 - 1."""

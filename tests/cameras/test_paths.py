@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from l2dgs_jax.cameras import camera_centres
-from l2dgs_jax.cameras.paths import centre_of_attention, interpolate, orbit, space_time_path, spiral
+from l2dgs_jax.cameras.paths import centre_of_attention, interpolate, is_path, orbit, space_time_path, spiral
 from l2dgs_jax.types import Camera
 
 
@@ -80,7 +80,9 @@ def test_path_stays_near_one_view_where_the_views_jump_about():
     viewmat[:, :3, :3] = rotations
     viewmat[:, :3, 3] = -np.einsum("fij,fj->fi", rotations, 4 * directions)
     cameras = Camera(viewmat, np.tile(np.eye(3), (60, 1, 1)), np.linspace(0, 1, 60))
+    assert not is_path(cameras)
     path = space_time_path(cameras, 48)
+    assert is_path(path)
     centres = centres_of(path)
     nearest = np.linalg.norm(centres.mean(0) - 4 * directions, axis=-1).argmin()
     assert np.linalg.norm(centres - 4 * directions[nearest], axis=-1).max() < 1

@@ -10,7 +10,7 @@ import pytest
 
 from l2dgs_jax import export
 from l2dgs_jax.data import clouds
-from l2dgs_jax.exporters.baking import Baked
+from l2dgs_jax.exporters import web_page
 from l2dgs_jax.exporters.splats import Splats
 from l2dgs_jax.runtime import command_line
 
@@ -32,16 +32,18 @@ def baked_times(monkeypatch):
     """In place of baking, which has its own tests: three Gaussians that move by the instant, one of them invisible."""
     times = []
 
-    def bake(run, instants, brightest):
+    def bake(run, instants, brightest, images=("welllit",)):
         assert brightest >= 1
         for time in instants:
             times.append(time)
             means = np.full((3, 3), time, np.float32)
             quats = np.tile(np.array([[1, 0, 0, 0]], np.float32), (3, 1))
             opacities = np.array([0.5, 0.001, 1], np.float32)
-            yield Baked(Splats(means, quats, means + 1, opacities, 0 * means + np.float32(0.25)), 30 + time)
+            yield (Splats(means, quats, means + 1, opacities, 0 * means + np.float32(0.25)),) * len(images)
 
     monkeypatch.setattr(export, "bake", bake)
+    for module in (export, web_page):
+        monkeypatch.setattr(module, "closeness", lambda run, splats, time, image="welllit": 30 + time)
     return times
 
 
@@ -79,12 +81,37 @@ def test_files_go_to_the_runs_folder_unless_told_otherwise(run_folder, baked_tim
     assert written == {"exports/scene.splat", "exports/splat/frame0001.splat"}
 
 
+def test_a_page_covers_all_instants(run_folder, baked_times, tmp_path, capsys):
+    run_command(run_folder, "--to", "html", "--times", 3, "--output", tmp_path / "page.html")
+    assert baked_times == [0, 0.5, 1]
+    assert [p.name for p in tmp_path.iterdir()] == ["page.html"]
+    output = capsys.readouterr().out
+    assert f"wrote {tmp_path / 'page.html'}, 0.0 MB" in output
+    assert "exact well-lit images: 30.25 to 30.75 dB" in output
+    assert "exact low-light images: 30.25 to 30.75 dB" in output
+
+
+def test_a_page_has_an_instant_for_every_frame_and_no_more_than_needed(run_folder, baked_times, tmp_path):
+    run_command(run_folder, "--to", "html", "--output", tmp_path / "page.html")
+    assert len(baked_times) == finished_run.FRAMES
+
+
+def test_a_page_of_nothing_is_not_written(run_folder, baked_times, tmp_path, monkeypatch, capsys):
+    canned = export.bake
+    gone = lambda splats: splats._replace(opacities=0 * splats.opacities)
+    monkeypatch.setattr(export, "bake", lambda *arguments: (tuple(map(gone, pair)) for pair in canned(*arguments)))
+    with pytest.raises(SystemExit):
+        run_command(run_folder, "--to", "html", "--times", 2, "--output", tmp_path / "page.html")
+    assert "nothing is visible; expected a trained scene" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_sequence_that_fails_leaves_nothing(run_folder, baked_times, tmp_path, monkeypatch, capsys):
     canned = export.bake
 
     def faint(run, times, brightest):
-        for (splats, psnr), time in zip(canned(run, times, brightest), times, strict=True):
-            yield Baked(splats._replace(opacities=splats.opacities * (time < 0.6)), psnr)
+        for (splats,), time in zip(canned(run, times, brightest), times, strict=True):
+            yield (splats._replace(opacities=splats.opacities * (time < 0.6)),)
 
     monkeypatch.setattr(export, "bake", faint)
     with pytest.raises(SystemExit):
@@ -118,6 +145,9 @@ def test_cameras_and_the_model(run_folder, tmp_path, capsys):
             "--time 0.5: npz covers all instants; expected it with one of ply, splat, gltf, cloud",
         ),
         (["--to", "cameras", "--times", "2"], "--times 2: cameras covers all instants"),
+        (["--to", "html", "--time", "0"], "--time 0.0: html covers all instants; expected it with one of ply, splat"),
+        (["--to", "html", "--times", "1"], "--times 1: html interpolates between instants; expected at least 2"),
+        (["--to", "html", "--times", "3", "--output", "x"], "--output x: expected a file name that ends in .html"),
         (["--to", "cameras", "--fps", "0"], "--fps 0: expected a whole number from 1"),
         (["--to", "gltf", "--output", "x.ply"], "--output x.ply: expected a file name that ends in .glb"),
         (["--to", "ply", "--times", "2", "--output", "{full}"], "exists already; expected a new or an empty folder"),
