@@ -107,7 +107,7 @@ def _record(dataset: Dataset, options: Train, config: Config, start: Checkpoint,
     print(f"{dataset.name}: {len(dataset.train.names)} frames of {dataset.width}x{dataset.height}; run folder {folder}")
     run = _fit(dataset, options, config, start, display)
     write_image(folder / runs.CONTACT_SHEET, contact_sheet(run))
-    video = write_run_video(run, folder / runs.VIDEO)
+    video = write_run_video(run, folder / runs.VIDEO, quiet=options.quiet)
     print(f"wrote {folder / runs.CONTACT_SHEET} and {video}")
     print(f"next: python -m l2dgs_jax.evaluate {folder}   or   python -m l2dgs_jax.render {folder}")
 

@@ -12,6 +12,7 @@ from l2dgs_jax.runs.checkpoints import Checkpoint
 from l2dgs_jax.runs.displays import Display
 from l2dgs_jax.runs.divergence import HALVINGS, halve_rates, rate_factor, standing
 from l2dgs_jax.runs.fitting import fit
+from l2dgs_jax.runs.pace import Pace
 from l2dgs_jax.runs.recorder import Recorder
 from l2dgs_jax.runs.run import Run
 from l2dgs_jax.runtime.memory import memory_errors
@@ -73,10 +74,11 @@ def _fit(
 ) -> Run:
     done = int(start.state.step)
     record = Recorder(folder, config, done, start.halvings)
+    pace = Pace(config, done, int(start.state.scene.alive.sum()))
 
     def on_step(progress: Progress) -> None:
         line = record(progress)
-        display("step", step=record.step, stage=config.stage_of(record.step))
+        display("step", step=record.step, stage=config.stage_of(record.step), left=pace(record.step))
         if line:
             display("metrics", **line)
         if record.step == config.coarse_steps < config.steps:
