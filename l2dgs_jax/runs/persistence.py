@@ -10,8 +10,9 @@ from l2dgs_jax.data import Dataset
 from l2dgs_jax.errors import DIVERGED, Interrupted, UserError
 from l2dgs_jax.runs.checkpoints import Checkpoint
 from l2dgs_jax.runs.displays import Display
-from l2dgs_jax.runs.divergence import HALVINGS, halve_rates, rate_factor, standing
+from l2dgs_jax.runs.divergence import HALVINGS, explosion, halve_rates, rate_factor, standing
 from l2dgs_jax.runs.fitting import fit
+from l2dgs_jax.runs.folder import read_metrics
 from l2dgs_jax.runs.pace import Pace
 from l2dgs_jax.runs.recorder import Recorder
 from l2dgs_jax.runs.run import Run
@@ -53,7 +54,7 @@ def fit_in_folder(
         except DivergedError as error:
             if start.halvings == HALVINGS or jax.process_count() > 1:
                 raise UserError(
-                    f"{folder}: {error}; expected finite values: train anew with lower learning rates", DIVERGED
+                    f"{folder}: {error}; expected a loss that falls: train anew with lower learning rates", DIVERGED
                 ) from None
             reason = str(error)
         halve_rates(folder, start.halvings + 1)
@@ -74,6 +75,7 @@ def _fit(
 ) -> Run:
     done = int(start.state.step)
     record = Recorder(folder, config, done, start.halvings)
+    losses = [line["loss"] for line in read_metrics(folder)]
     pace = Pace(config, done, int(start.state.scene.alive.sum()))
 
     def on_step(progress: Progress) -> None:
@@ -81,6 +83,10 @@ def _fit(
         display("step", step=record.step, stage=config.stage_of(record.step), left=pace(record.step))
         if line:
             display("metrics", **line)
+            losses.append(line["loss"])
+            grown = explosion(losses)
+            if grown and jax.process_count() == 1:
+                raise DivergedError(f"by step {record.step} the loss has grown {grown:.0f}-fold", progress)
         if record.step == config.coarse_steps < config.steps:
             display("compiling", stage="fine")
         signal_number = stopping()
