@@ -6,6 +6,7 @@ A display is told of events, `display(event, **facts)`:
 * compiling: the program of a `stage`, before the first step that needs it;
 * step: that of number `step`, of a `stage`, is done, and `left` seconds are if that is known yet;
 * metrics: the facts are a line of metrics;
+* previews: the pictures after a `step` have been drawn, to `files` in the run folder;
 * any other: something has happened, and `message` says what.
 """
 
@@ -14,7 +15,7 @@ import json
 import os
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 from tqdm import tqdm
@@ -42,6 +43,16 @@ def choose(quiet: bool = False, as_json: bool = False) -> Iterator[Display]:
             yield bar
     else:
         yield _Log()
+
+
+def together(displays: Sequence[Display]) -> Display:
+    """A display that tells all of these."""
+
+    def tell(event: str, **facts: Any) -> None:
+        for display in displays:
+            display(event, **facts)
+
+    return tell
 
 
 def _as_json(event: str, facts: dict[str, Any]) -> str:

@@ -82,7 +82,7 @@ def go_on(place, dataset, watcher=None, config=CONFIG):
 
 def metrics(place):
     lines = [json.loads(line) for line in (place / runs.METRICS).read_text().splitlines()]
-    return [{name: value for name, value in line.items() if name != "seconds"} for line in lines]
+    return [{name: value for name, value in line.items() if name not in ("seconds", "memory")} for line in lines]
 
 
 class KilledError(BaseException):
