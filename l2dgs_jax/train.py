@@ -202,8 +202,9 @@ def _show_help(arguments: Sequence[str]) -> None:
     """Show the preset's settings as defaults, and exit."""
     asked = [argument for argument in arguments if argument not in command_line.HELP]
     preset = _preset(command_line.parse(Train, asked, "train", Train(scene="")))
-    shown = functools.partial(Train, preset=preset, hosts=Hosts(), config=PRESETS[preset])  # the scene is still missing
-    command_line.parse(shown, ["--help"], "train")
+    # A scene is still wanted: an instance could not be without one.
+    shown = functools.partial(Train, preset=preset, hosts=Hosts(), config=PRESETS[preset])
+    command_line.parse(shown, ["--help"], "train")  # type: ignore[arg-type]
 
 
 def _preset(options: Train) -> str:

@@ -18,7 +18,7 @@ from l2dgs_jax.runtime.files import make_folder, replacing
 from l2dgs_jax.training.step import TrainState, with_capacity
 
 PREVIEWS = "previews"
-VIEWS = {"held out": "test", "training": "train"}  # of which split
+VIEWS = {"held-out": "test", "training": "train"}  # of which split
 INPUT, LOWLIGHT, WELLLIT = "input", "lowlight", "welllit"
 MOST, APART = 8, 100  # moments of a run, and steps between them at least
 LONG = 1000  # steps of a coarse stage that are worth the compilation of its own program

@@ -5,6 +5,7 @@ import contextlib
 import html
 import json
 import math
+import re
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,7 +18,7 @@ from l2dgs_jax.runs.recorder import terms
 from l2dgs_jax.runtime.files import replacing
 
 REPORT = "report.html"
-INTERVAL = 10  # seconds between two writings
+INTERVAL = 15  # seconds between two writings
 POINTS = 400  # of a curve, about
 TEMPLATE = Path(__file__).with_name(REPORT)  # with TITLE and DATA in the places of what is shown
 
@@ -77,11 +78,9 @@ class Report:
             "views": _views(self.folder),
         }
         data = json.dumps(content).replace("<", "\\u003c")  # lest something in it end the script that holds it
-        page = (
-            TEMPLATE.read_text().replace("TITLE", html.escape(str(self.shown.get("scene", "")))).replace("DATA", data)
-        )
+        parts = {"TITLE": html.escape(self.shown.get("scene", "")), "DATA": data}
         with replacing(self.folder / REPORT) as temporary:
-            temporary.write_text(page)
+            temporary.write_text(re.sub("|".join(parts), lambda found: parts[found[0]], TEMPLATE.read_text()))
 
 
 def curves(lines: Sequence[dict[str, Any]]) -> dict[str, Any]:
@@ -105,7 +104,7 @@ def curves(lines: Sequence[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
-def _column(lines: Sequence[dict[str, Any]], name: str) -> list[float | None]:
+def _column(lines: Sequence[dict[str, Any]], name: str) -> list[int | float | None]:
     values = (line.get(name) for line in lines)
     return [value if value is not None and math.isfinite(value) else None for value in values]
 

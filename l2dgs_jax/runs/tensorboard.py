@@ -33,8 +33,10 @@ class TensorBoard:
             self.writer = None
         if event == "begin":
             # Later steps that were written are of before the run was interrupted or put back.
-            place, lost = str(self.folder / EVENTS), facts["step"] + 1
-            self.writer = self.library.SummaryWriter(place, purge_step=lost, flush_secs=FLUSH)
+            lost = facts["step"] + 1
+            self.writer = self.library.SummaryWriter(
+                str(self.folder / EVENTS), purge_step=lost, filename_suffix=f".{lost}", flush_secs=FLUSH
+            )
         elif event == "metrics" and self.writer:
             for name, value in _scalars(facts).items():
                 self.writer.add_scalar(name, value, facts["step"])

@@ -53,8 +53,8 @@ def _show_warning(message: Warning | str, *_: Any) -> None:
     print(f"warning: {message}", file=sys.stderr)
 
 
-def parse(kind: Callable[..., T], arguments: Sequence[str], program: str, default: T | None = None) -> T:
-    """Parse command-line arguments into the dataclass `kind`, of which some fields may be given."""
+def parse(kind: type[T], arguments: Sequence[str], program: str, default: T | None = None) -> T:
+    """Parse command-line arguments into the dataclass `kind`."""
     script = f"l2dgs {program}"
     program = script if sys.argv[0] == script else f"python -m l2dgs_jax.{program}"
     if default is None:
