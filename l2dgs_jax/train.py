@@ -42,10 +42,9 @@ class Train:
 
     Attributes:
         scene: folder of the scene, or "demo" for the clip that comes with the package.
-        preset: settings to start from, which the options below override one by one; the
-            defaults shown here are the preset's. Their steps: demo 400, fast 600, default 1200 (about five
-            minutes on one core for frames of 200x112, and more with pixels and points), best 5000, authors 17000,
-            paper 23000.
+        preset: settings to start from, which the options below override one by one; the defaults shown here are the
+            preset's. Their steps: demo 400, fast 600, default 1200 (about five minutes on one core for frames of
+            200x112, and more with pixels and points), best 5000, authors 17000, paper 23000.
         output: run folder; a fresh one under runs/ if not given.
         resume: continue the run in the output folder from its last checkpoint.
         devices: how many devices the views of a step are spread over; each core of a processor is one. If not given,
@@ -148,15 +147,9 @@ def _fit(dataset: Dataset, options: Train, config: Config, start: Checkpoint, di
     command = shlex.join(["python", "-m", "l2dgs_jax.train", options.scene, "--output", str(folder), "--resume"])
     try:
         with stop_requests(lambda: display("stopping", message=notice)) as stopping:
+            previews = options.report or options.tensorboard
             return fit_in_folder(
-                folder,
-                dataset,
-                config,
-                start,
-                display,
-                stopping,
-                options.devices,
-                options.report or options.tensorboard,
+                folder, dataset, config, start, display, stopping, options.devices, with_previews=previews
             )
     except Interrupted as stop:
         raise Interrupted(f"{stop}; go on with: {command}", stop.code) from None

@@ -1,4 +1,4 @@
-"""A browser that plays a video and says what it saw."""
+"""A browser that plays a video and says what it saw, or draws a page."""
 
 import http.server
 import queue
@@ -54,3 +54,10 @@ def played(path, profile, seconds=30):
             finally:
                 browser.terminate()
                 server.shutdown()
+
+
+def dom(path, profile):
+    """The page of a file after its scripts have run."""
+    options = ["--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={profile}", "--dump-dom"]
+    done = subprocess.run(["chromium", *options, path.as_uri()], capture_output=True, text=True, timeout=60, check=True)
+    return done.stdout

@@ -1,7 +1,7 @@
 """The README and the pages of the documentation: what they tell to type is run as printed.
 
-Trainings are shortened in one way, by the options of `SHORT`. SCENE, RUN and runs/demo are a tiny scene and a tiny run,
-and so is the demo.
+Trainings are shortened in one way: they have the options of `SHORT`, and their steps only count. SCENE and the demo are
+a tiny scene, RUN and runs/demo a tiny run.
 """
 
 import importlib
@@ -11,16 +11,20 @@ import shutil
 from pathlib import Path
 
 import finished_run
+import jax.numpy as jnp
 import pytest
 from scenes import write_nerfies
+from tiny_training import report
 
 from l2dgs_jax.__main__ import COMMANDS
 from l2dgs_jax.data import demo
 from l2dgs_jax.study.spec import read
+from l2dgs_jax.training import engine
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 SHORT = ["--coarse-steps=0", "--fine-steps=2", "--model.plane-size=4", "--model.plane-scales=1", "--model.hidden=8"]
+SHORT += ["--model.plane-channels=2", "--model.no-tracks", "--inbetweens=0"]
 # Not run: what installs; what finds poses, trains studies or chooses kernels, as their own tests do; and what wants
 # several hosts, weights that are not here, or hours.
 INSTALLS = ("git ", "cd ", "pip ", "pytest", "pre-commit")
@@ -49,15 +53,20 @@ def test_every_command_of_the_documentation_is_one_of_the_package():
         assert module.removeprefix("l2dgs_jax.") in COMMANDS
 
 
+def counted(states, *_, **__):
+    return states._replace(step=states.step + 1), report(), engine.Tally(jnp.int32(0), jnp.int32(1))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("page", [page for page in PAGES if any(programs(page))], ids=lambda page: page.stem)
 def test_what_a_page_tells_to_type_runs(page, tmp_path_factory, tmp_path, monkeypatch):
     run = finished_run.folder(tmp_path_factory.getbasetemp() / "docs")
-    scene = write_nerfies(tmp_path / "SCENE", 10, 48, 36, num_points=40, truth=True)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(demo, "FOLDER", scene)
+    shutil.copytree(run.parent / "tiny_scene", "SCENE")
     for name in ("RUN", "runs/demo"):
         shutil.copytree(run, name)
+    monkeypatch.setattr(demo, "FOLDER", tmp_path / "SCENE")
+    monkeypatch.setattr(engine, "train_steps", counted)
     for _, _, module, *arguments in programs(page):
         training = module.endswith("train") and "--resume" not in arguments
         for place in ("OUT", "RUN") if training else ("OUT",):  # pages show several commands that fill the same one

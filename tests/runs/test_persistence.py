@@ -13,7 +13,7 @@ import signal
 import jax
 import jax.numpy as jnp
 import pytest
-from tiny_training import assert_equal_states, make_dataset, tiny
+from tiny_training import assert_equal_states, make_dataset, report, tiny
 
 from l2dgs_jax import runs
 from l2dgs_jax.config import DensityConfig
@@ -21,7 +21,6 @@ from l2dgs_jax.errors import DISK_FULL, DIVERGED, OUT_OF_MEMORY, Interrupted, Us
 from l2dgs_jax.runs import checkpoints, folder, persistence, recorder
 from l2dgs_jax.runs.divergence import standing
 from l2dgs_jax.training import engine, initial_state
-from l2dgs_jax.training.step import StepReport
 
 CONFIG = tiny(checkpoint_every=3, density=DensityConfig(start=1, stop=0))
 STEPS = CONFIG.steps
@@ -30,11 +29,6 @@ STEPS = CONFIG.steps
 @pytest.fixture(scope="module")
 def dataset():
     return make_dataset()
-
-
-def report(loss=0.0):
-    zero, no = jnp.zeros(1), jnp.zeros(1, bool)
-    return StepReport(zero + loss, {"l1": zero}, zero, jnp.zeros(1, jnp.int32), no, no)
 
 
 def count(states, batches, values, number, *, config, **_):

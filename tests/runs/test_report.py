@@ -3,11 +3,11 @@
 import json
 import re
 import shutil
-import subprocess
 import sys
 
 import numpy as np
 import pytest
+from browser import dom
 
 from l2dgs_jax.data.images import to_bytes
 from l2dgs_jax.errors import UserError
@@ -185,10 +185,3 @@ def test_a_browser_draws_the_page(tmp_path):
     assert drawn.count("<svg") == 4 + 2 + 2
     assert drawn.count('src="data:image/jpeg') == 6
     assert re.search(r"<b>600</b>", drawn)
-
-
-def dom(path, profile):
-    """The page after its script has run."""
-    options = ["--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={profile}", "--dump-dom"]
-    done = subprocess.run(["chromium", *options, path.as_uri()], capture_output=True, text=True, timeout=60, check=True)
-    return done.stdout
