@@ -186,7 +186,7 @@ def _parse(arguments: Sequence[str]) -> Train:
             raise UserError(
                 f"{folder}: already holds another run or files; expected a new folder for --output, or --resume"
             )
-    options = command_line.parse(Train, arguments, "train", dataclasses.replace(first, config=base))
+    options = command_line.parse(Train, arguments, "train", Train(scene=first.scene, config=base))
     options.config.check_counts()
     return dataclasses.replace(options, scene=first.scene, output=folder)
 

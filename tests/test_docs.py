@@ -1,7 +1,7 @@
 """The README and the pages of the documentation: what they tell to type is run as printed.
 
-Trainings are shortened in one way: they have the options of `SHORT`, and their steps only count. SCENE and the demo are
-a tiny scene, RUN and runs/demo a tiny run.
+Trainings are shortened in one way: they have the options of `SHORT`, their steps only count, and they draw no pictures.
+SCENE and the demo are a tiny scene, RUN and runs/demo a tiny run.
 """
 
 import importlib
@@ -12,10 +12,12 @@ from pathlib import Path
 
 import finished_run
 import jax.numpy as jnp
+import numpy as np
 import pytest
 from scenes import write_nerfies
 from tiny_training import report
 
+from l2dgs_jax import train
 from l2dgs_jax.__main__ import COMMANDS
 from l2dgs_jax.data import demo
 from l2dgs_jax.study.spec import read
@@ -24,7 +26,7 @@ from l2dgs_jax.training import engine
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 SHORT = ["--coarse-steps=0", "--fine-steps=2", "--model.plane-size=4", "--model.plane-scales=1", "--model.hidden=8"]
-SHORT += ["--model.plane-channels=2", "--model.no-tracks", "--inbetweens=0"]
+SHORT += ["--model.plane-channels=2", "--model.no-tracks", "--inbetweens=0", "--no-report"]
 # Not run: what installs; what finds poses, trains studies or chooses kernels, as their own tests do; and what wants
 # several hosts, weights that are not here, or hours.
 INSTALLS = ("git ", "cd ", "pip ", "pytest", "pre-commit")
@@ -62,11 +64,13 @@ def counted(states, *_, **__):
 def test_what_a_page_tells_to_type_runs(page, tmp_path_factory, tmp_path, monkeypatch):
     run = finished_run.folder(tmp_path_factory.getbasetemp() / "docs")
     monkeypatch.chdir(tmp_path)
-    shutil.copytree(run.parent / "tiny_scene", "SCENE")
+    write_nerfies(tmp_path / "SCENE", finished_run.FRAMES, finished_run.WIDTH, finished_run.HEIGHT, num_points=40)
     for name in ("RUN", "runs/demo"):
         shutil.copytree(run, name)
     monkeypatch.setattr(demo, "FOLDER", tmp_path / "SCENE")
     monkeypatch.setattr(engine, "train_steps", counted)
+    monkeypatch.setattr(train, "contact_sheet", lambda run: np.zeros((8, 8, 3), np.uint8))
+    monkeypatch.setattr(train, "write_run_video", lambda run, stem, quiet: stem)
     for _, _, module, *arguments in programs(page):
         training = module.endswith("train") and "--resume" not in arguments
         for place in ("OUT", "RUN") if training else ("OUT",):  # pages show several commands that fill the same one

@@ -272,6 +272,14 @@ def test_what_cannot_start_leaves_no_folder(refuses, scene, tmp_path, monkeypatc
     assert not (tmp_path / "run").exists()
 
 
+def test_options_of_the_run_are_read_with_every_preset(scene, tmp_path):
+    flags = ["--quiet", "--json", "--no-report", "--tensorboard", "--devices=1"]
+    options = train._parse([str(scene), *flags, "--preset=fast", "--output", str(tmp_path / "run"), "--fine-steps=7"])
+    assert (options.quiet, options.json, options.report, options.tensorboard) == (True, True, False, True)
+    assert (options.devices, options.config.fine_steps, options.config.coarse_steps) == (1, 7, 100)
+    assert not options.resume
+
+
 def shown_default(capsys, arguments, option):
     with pytest.raises(SystemExit) as caught:
         train.main(arguments)
