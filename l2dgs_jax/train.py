@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import functools
 import shlex
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -22,6 +23,8 @@ from l2dgs_jax.runs.advice import misfit
 from l2dgs_jax.runs.displays import Display
 from l2dgs_jax.runs.divergence import standing
 from l2dgs_jax.runs.persistence import LESS_MEMORY, fit_in_folder
+from l2dgs_jax.runs.report import REPORT, Report
+from l2dgs_jax.runs.tensorboard import TensorBoard, tensorboardx
 from l2dgs_jax.runtime import command_line, devices, distributed
 from l2dgs_jax.runtime.distributed import Hosts
 from l2dgs_jax.runtime.files import is_taken, new_folder
@@ -31,6 +34,8 @@ from l2dgs_jax.runtime.signals import stop_requests
 from l2dgs_jax.training import initial_state, resolve
 from l2dgs_jax.visualize import contact_sheet, write_run_video
 
+_Flag = tyro.conf.FlagCreatePairsOff[bool]
+
 
 @dataclass(frozen=True)
 class Train:
@@ -38,25 +43,30 @@ class Train:
 
     Attributes:
         scene: folder of the scene, or "demo" for the clip that comes with the package.
-        preset: settings to start from; the options below override single ones. demo: 400 steps; fast: 600; default:
-            1,200, about five minutes on one core for frames of 200x112, and more with pixels and points; best: 5,000;
-            authors: 17,000; paper: 23,000. To compare with, 1,200 steps each: 4dgs, enhance-4dgs, static.
+        preset: settings to start from, which the options below override one by one; the defaults shown here are the
+            preset's. Their steps: demo 400, fast 600, default 1200 (about five minutes on one core for frames of
+            200x112, and more with pixels and points), best 5000, authors 17000, paper 23000; to compare with, 1200
+            each: 4dgs, enhance-4dgs, static.
         output: run folder; a fresh one under runs/ if not given.
         resume: continue the run in the output folder from its last checkpoint.
         devices: how many devices the views of a step are spread over; each core of a processor is one. If not given,
             as many as share them evenly.
         quiet: show nothing but warnings and errors.
         json: print one JSON object a line, docs/training.md says which.
+        report: leave out report.html, a page in the run folder that shows how it goes.
+        tensorboard: write events for TensorBoard to the run folder; wants the extra of that name.
         hosts: several processes.
     """
 
     scene: tyro.conf.Positional[str]
-    preset: str | None = None
-    output: Path | None = None
-    resume: bool = False
-    devices: int | None = None
-    quiet: bool = False
-    json: bool = False
+    preset: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
+    output: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
+    resume: _Flag = False
+    devices: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
+    quiet: _Flag = False
+    json: _Flag = False
+    report: _Flag = True
+    tensorboard: _Flag = False
     hosts: Annotated[Hosts, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Hosts)
     config: Annotated[Config, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Config)
 
@@ -74,6 +84,8 @@ def _train(options: Train) -> None:
     folder, config, first = options.output, options.config, jax.process_index() == 0
     assert folder is not None
     _check_devices(options)
+    if options.tensorboard:
+        tensorboardx()
     with contextlib.ExitStack() as stack:
         if options.resume and first:
             stack.enter_context(locked(folder))
@@ -89,11 +101,25 @@ def _train(options: Train) -> None:
                 with new_folder(folder) as place:
                     runs.write_settings(place, options.scene, config)
                 stack.enter_context(locked(folder))
-            with displays.choose(options.quiet, options.json) as display, _end_told(display):
+            with _display(options) as display, _end_told(display):
                 _record(dataset, options, config, start, display)
         else:
             runs.fit(dataset, config, start=start, device_count=options.devices)
         distributed.barrier("the run is finished")
+
+
+@contextlib.contextmanager
+def _display(options: Train) -> Iterator[Display]:
+    """All that shows how it goes."""
+    folder = options.output
+    assert folder is not None
+    with displays.choose(options.quiet, options.json) as display:
+        shown = [display]
+        if options.report:
+            shown.append(Report(folder))
+        if options.tensorboard:
+            shown.append(TensorBoard(folder))
+        yield displays.together(shown)
 
 
 def _record(dataset: Dataset, options: Train, config: Config, start: Checkpoint, display: Display) -> None:
@@ -107,9 +133,11 @@ def _record(dataset: Dataset, options: Train, config: Config, start: Checkpoint,
     if warning:
         print(f"warning: {warning}")
     print(f"{dataset.name}: {len(dataset.train.names)} frames of {dataset.width}x{dataset.height}; run folder {folder}")
+    if options.report:
+        print(f"watch it in a browser: {(folder / REPORT).absolute().as_uri()}")
     run = _fit(dataset, options, config, start, display)
     write_image(folder / runs.CONTACT_SHEET, contact_sheet(run))
-    video = write_run_video(run, folder / runs.VIDEO)
+    video = write_run_video(run, folder / runs.VIDEO, quiet=options.quiet)
     print(f"wrote {folder / runs.CONTACT_SHEET} and {video}")
     print(f"next: python -m l2dgs_jax.evaluate {folder}   or   python -m l2dgs_jax.render {folder}")
 
@@ -122,7 +150,10 @@ def _fit(dataset: Dataset, options: Train, config: Config, start: Checkpoint, di
     command = shlex.join(["python", "-m", "l2dgs_jax.train", options.scene, "--output", str(folder), "--resume"])
     try:
         with stop_requests(lambda: display("stopping", message=notice)) as stopping:
-            return fit_in_folder(folder, dataset, config, start, display, stopping, options.devices)
+            previews = options.report or options.tensorboard
+            return fit_in_folder(
+                folder, dataset, config, start, display, stopping, options.devices, with_previews=previews
+            )
     except Interrupted as stop:
         raise Interrupted(f"{stop}; go on with: {command}", stop.code) from None
     except UserError as error:
@@ -144,6 +175,8 @@ def _end_told(display: Display) -> Iterator[None]:
 
 def _parse(arguments: Sequence[str]) -> Train:
     """Parse twice: preset, scene and run folder decide what the other options override."""
+    if command_line.HELP & set(arguments):
+        _show_help(arguments)
     first = command_line.parse(Train, arguments, "train")
     if first.scene != "demo":
         first = dataclasses.replace(first, scene=str(Path(first.scene).absolute()))
@@ -151,17 +184,31 @@ def _parse(arguments: Sequence[str]) -> Train:
     if first.resume:
         base = runs.read_settings(folder)[1]
     else:
-        preset = first.preset or ("demo" if first.scene == "demo" else "default")
-        if preset not in PRESETS:
-            raise UserError(f"--preset {preset}: no such preset; expected one of {', '.join(PRESETS)}")
-        base = PRESETS[preset]
+        base = PRESETS[_preset(first)]
         if is_taken(folder):
             raise UserError(
                 f"{folder}: already holds another run or files; expected a new folder for --output, or --resume"
             )
-    options = command_line.parse(Train, arguments, "train", dataclasses.replace(first, config=base))
+    options = command_line.parse(Train, arguments, "train", Train(scene=first.scene, config=base))
     options.config.check_counts()
     return dataclasses.replace(options, scene=first.scene, output=folder)
+
+
+def _show_help(arguments: Sequence[str]) -> None:
+    """Show the preset's settings as defaults, and exit."""
+    asked = [argument for argument in arguments if argument not in command_line.HELP]
+    preset = _preset(command_line.parse(Train, asked, "train", Train(scene="")))
+    # A scene is still wanted: an instance could not be without one.
+    shown = functools.partial(Train, preset=preset, hosts=Hosts(), config=PRESETS[preset])
+    command_line.parse(shown, ["--help"], "train")  # type: ignore[arg-type]
+
+
+def _preset(options: Train) -> str:
+    """The preset that is asked for, or else the scene's."""
+    preset = options.preset or ("demo" if options.scene == "demo" else "default")
+    if preset not in PRESETS:
+        raise UserError(f"--preset {preset}: no such preset; expected one of {', '.join(PRESETS)}")
+    return preset
 
 
 def _run_folder(scene: str, resume: bool) -> Path:

@@ -82,7 +82,7 @@ class ModelConfig:
     sh_degree: int = 3  # bands k of Eq. 2; (k+1)^2 coefficients
     plane_size: int = 64  # cells of a spatial axis at the coarsest scale
     plane_scales: tuple[int, ...] = (1, 2, 4)  # factors on plane_size, concatenated; time is never scaled
-    plane_channels: int = 16
+    plane_channels: int = 16  # of the feature that a cell holds
     box_points: Number = 1.0  # share of the points, along each axis, that the planes' box spans
     box_rim: float = 0.0  # share of the planes' cells for what lies beyond, contracted; 0: it takes the box's border
     time_size: int | None = None  # cells of the time axis; None: half the number of training frames
@@ -100,7 +100,7 @@ class ModelConfig:
     illumination_offset: Number = 0.5  # l = max(offset + sum a_j b_j B_j, 0)
     # N(0, 1), U(0, 1), or the frames' colours at the points, with the darkening of model/tone.py undone
     reflectance_init: Literal["normal", "uniform", "observed"] = "uniform"
-    attenuation_init: Literal["normal", "uniform"] = "uniform"
+    attenuation_init: Literal["normal", "uniform"] = "uniform"  # N(0, 1) or U(0, 1)
     # B1, B2 that BAFE-Net starts at; None: zero bias, 5.5. B1 "auto": what the frames' darkness implies (model/tone.py)
     initial_exponents: Exponents = None
     # l of every Gaussian at the start; None: luminance of the points. "auto": what makes L^B2 the darkening's gain
@@ -131,16 +131,16 @@ class LossConfig:
     """Weights and forms of Eqs. 10-15 and of the plane regularisers."""
 
     l1_on: Literal["raw", "tonemapped"] = "raw"  # first term of Eq. 10 on I, or on (I + eps)^eta like the second
-    ssim: Number = 1.0
-    eps: Number = EPS
-    eta_start: Number = 0.95
-    eta_end: Number = 0.5
+    ssim: Number = 1.0  # weight of 1 - SSIM in Eq. 10
+    eps: Number = EPS  # of Eq. 10
+    eta_start: Number = 0.95  # exponent of Eq. 10 at the start
+    eta_end: Number = 0.5  # the same at the end
     eta_restarts: bool = False  # the decay starts anew with the fine stage
     exposure: Number = 0.01  # lambda_1, Eq. 11
-    exposure_level: Number = 0.6
-    exposure_of: Literal["reflectance", "welllit"] = "reflectance"
+    exposure_level: Number = 0.6  # mean brightness that Eq. 11 asks for, sRGB: the knob for a brighter or darker result
+    exposure_of: Literal["reflectance", "welllit"] = "reflectance"  # the image whose brightness that is
     exposure_window: int | None = 16  # pixels; None: the mean of the whole image
-    exposure_form: Literal["absolute", "squared"] = "absolute"
+    exposure_form: Literal["absolute", "squared"] = "absolute"  # what the difference counts as
     amplification: Number = 0.05  # lambda_2, Eq. 13
     # Weight of mean |1 - R_w|, beside Eq. 13 or instead of it (Table 3, L + 0.05 |1 - R_w| and Maximize R_w)
     reflectance_amplification: Number = 0.0
@@ -150,7 +150,7 @@ class LossConfig:
     structure_beta_illumination: OptionalNumber = None  # beta_2, Eq. 14; None: as beta_1
     structure_gradient: Literal["components", "magnitude"] = "components"  # forward differences, or sqrt(dx^2 + dy^2)
     depth: Number = 0.001  # lambda_5, Eq. 12
-    depth_gradient: Literal["forward", "sobel"] = "forward"
+    depth_gradient: Literal["forward", "sobel"] = "forward"  # differences in Eq. 12
     depth_gain: Number = 1.0  # factor on D inside Eq. 12
     illumination_tv: Number = 0.0  # mean |forward difference| of L_w
     exponent_prior: Number = 0.0  # mean |B1 - initial B1|
@@ -176,13 +176,9 @@ class OptimConfig:
     ocd_lr_end: Number = 1.6e-5
     bafe_lr: Number = 1.6e-3
     bafe_lr_end: Number = 1.6e-4
-    extent_scales: tuple[str, ...] = (
-        "means",
-        "heads",
-        "planes",
-    )  # RATE_GROUPS whose rates the extent multiplies
+    extent_scales: tuple[str, ...] = ("means", "heads", "planes")  # RATE_GROUPS whose rates the extent multiplies
     illumination_lr: Number = 2.5e-3
-    illumination_rest_divisor: Number = 20.0
+    illumination_rest_divisor: Number = 20.0  # of illumination_lr, for the higher bands
     reflectance_lr: Number = 1e-5
     attenuation_lr: Number = 1e-5
     opacity_lr: Number = 0.05
@@ -210,9 +206,9 @@ class DensityConfig:
     # "adaptive": clone, split and prune (3D Gaussian Splatting, arXiv 2308.04079, as 4DGS sets it); "mcmc": relocation
     # and noise in a fixed capacity (arXiv 2404.09591)
     method: Literal["adaptive", "mcmc"] = "adaptive"
-    start: int = 500  # of each stage, steps
-    stop: int = 10_000
-    interval: int = 100
+    start: int = 500  # steps of each stage before it changes
+    stop: int = 10_000  # steps of each stage after which it stays
+    interval: int = 100  # steps between two changes
     grad_threshold: Number = 2e-4  # mean norm of dL/d(mean2d), normalised device coordinates
     clone_below: Number = 0.01  # of the extent; larger Gaussians split
     conserve_opacity: bool = False  # a new pair covers as much as its source did (arXiv 2404.06109)
@@ -226,17 +222,17 @@ class DensityConfig:
 class Config:
     """All settings of a training run; saved as `config.json` in its folder."""
 
-    coarse_steps: int = 3000
-    fine_steps: int = 20_000
+    coarse_steps: int = 3000  # of the first stage, in which nothing moves
+    fine_steps: int = 20_000  # of the second, in which things do
     batch_size: int = 2  # views a step
-    seed: Count = 0
+    seed: Count = 0  # of all that is random
     downscale: int = 1  # reads images at 1/downscale of their full size
     format: Layout = "auto"  # of the scene's folder; "auto": found from its contents
     held_out: str = "auto"  # views not trained on: the scene's own, "4dgs", or k for every k-th (data/splits.py)
     sh_warmup: int | None = 1000  # steps between activating one more SH band; None: all by half of the run
     drop: Number = 0.0  # share of the Gaussians that a step leaves out at random, at the end of the run
-    checkpoint_every: int = 500  # steps
-    keep_checkpoints: int = 2  # the last ones, in case that the very last is damaged
+    checkpoint_every: int = 500  # steps between checkpoints
+    keep_checkpoints: int = 2  # how many of the last ones stay, in case that the very last is damaged
     # Share of the views that lie between two frames of the video, drawn by optical flow (training/inbetweens.py)
     inbetweens: float = 0.0
     # How the frames are brightened before training, where low light is not modelled (preprocess/enhancement.py)

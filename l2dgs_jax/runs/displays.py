@@ -4,8 +4,9 @@ A display is told of events, `display(event, **facts)`:
 
 * begin: it goes on after `step` of `steps`, at first and when it was put back;
 * compiling: the program of a `stage`, before the first step that needs it;
-* step: that of number `step`, of a `stage`, is done;
+* step: that of number `step`, of a `stage`, is done, and `left` seconds are if that is known yet;
 * metrics: the facts are a line of metrics;
+* previews: the pictures after a `step` have been drawn, to `files` in the run folder;
 * any other: something has happened, and `message` says what.
 """
 
@@ -14,7 +15,7 @@ import json
 import os
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 from tqdm import tqdm
@@ -44,6 +45,16 @@ def choose(quiet: bool = False, as_json: bool = False) -> Iterator[Display]:
         yield _Log()
 
 
+def together(displays: Sequence[Display]) -> Display:
+    """A display that tells all of these."""
+
+    def tell(event: str, **facts: Any) -> None:
+        for display in displays:
+            display(event, **facts)
+
+    return tell
+
+
 def _as_json(event: str, facts: dict[str, Any]) -> str:
     """An object and its newline, to be printed in one piece: threads tell things too."""
     if event == "step":
@@ -51,16 +62,29 @@ def _as_json(event: str, facts: dict[str, Any]) -> str:
     return json.dumps(facts if event == "metrics" else {"event": event} | facts) + "\n"
 
 
+class _Steps(tqdm):
+    """tqdm's own time left takes all steps for alike."""
+
+    left: float | None = None
+
+    @property
+    def format_dict(self) -> dict[str, Any]:
+        return super().format_dict | {"left": "?" if self.left is None else tqdm.format_interval(self.left)}
+
+
 class _Bar:
-    """A bar with the time left at the pace of the last steps, compilation left out."""
+    """A bar with the time left."""
 
     def __init__(self) -> None:
-        self.bar: tqdm | None = None
+        self.bar: _Steps | None = None
         self.compiling = False
 
     def __call__(self, event: str, **facts: Any) -> None:
         if event == "begin":
-            self.bar = self.bar or tqdm(total=facts["steps"], initial=facts["step"], unit="step", dynamic_ncols=True)
+            form = "{l_bar}{bar}| {n_fmt}/{total_fmt} [{elapsed}<{left}, {rate_fmt}{postfix}]"
+            self.bar = self.bar or _Steps(
+                total=facts["steps"], initial=facts["step"], unit="step", dynamic_ncols=True, bar_format=form
+            )
             self.bar.update(facts["step"] - self.bar.n)
         elif self.bar and event == "compiling":
             self.compiling = True
@@ -70,6 +94,7 @@ class _Bar:
                 self.compiling = False
                 self.bar.unpause()
                 self.bar.set_description(facts["stage"], refresh=False)
+            self.bar.left = facts["left"]
             self.bar.update()
         elif self.bar and event == "metrics":
             self.bar.set_postfix_str(_summary(facts))
@@ -82,32 +107,26 @@ class _Bar:
 
 
 class _Log:
-    """A line now and then; the time left is at the pace since the line before, compilation left out."""
+    """A line now and then."""
 
     def __init__(self) -> None:
         self.steps, self.due = 0, 0.0
-        self.since: tuple[int, float] | None = None
+        self.left: float | None = None
 
     def __call__(self, event: str, **facts: Any) -> None:
         now = time.monotonic()
         if event == "begin":
             self.steps = facts["steps"]
         elif event == "compiling":
-            self.since = None
             _write(f"compiling the {facts['stage']} stage")
-        elif event == "step" and self.since is None:
-            self.since = facts["step"], now
+        elif event == "step":
+            self.left = facts["left"]
         elif event == "metrics" and (now >= self.due or facts["step"] == self.steps):
-            _write(f"{facts['stage']} {facts['step']}/{self.steps}: {_summary(facts)}{self._left(facts['step'], now)}")
-            self.since, self.due = (facts["step"], now), now + INTERVAL
+            self.due = now + INTERVAL
+            left = f", {tqdm.format_interval(self.left)} left" if self.left else ""
+            _write(f"{facts['stage']} {facts['step']}/{self.steps}: {_summary(facts)}{left}")
         elif "message" in facts:
             _write(facts["message"])
-
-    def _left(self, step: int, now: float) -> str:
-        if self.since is None or not self.since[0] < step < self.steps:
-            return ""
-        pace = (now - self.since[1]) / (step - self.since[0])
-        return f", {tqdm.format_interval((self.steps - step) * pace)} left"
 
 
 def _write(line: str) -> None:

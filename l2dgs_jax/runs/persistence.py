@@ -8,12 +8,16 @@ import jax
 from l2dgs_jax.config import Config
 from l2dgs_jax.data import Dataset
 from l2dgs_jax.errors import DIVERGED, Interrupted, UserError
+from l2dgs_jax.runs import previews
 from l2dgs_jax.runs.checkpoints import Checkpoint
 from l2dgs_jax.runs.displays import Display
-from l2dgs_jax.runs.divergence import HALVINGS, halve_rates, rate_factor, standing
+from l2dgs_jax.runs.divergence import HALVINGS, explosion, halve_rates, rate_factor, standing
 from l2dgs_jax.runs.fitting import fit
+from l2dgs_jax.runs.folder import read_metrics
+from l2dgs_jax.runs.pace import Pace
 from l2dgs_jax.runs.recorder import Recorder
 from l2dgs_jax.runs.run import Run
+from l2dgs_jax.runtime import devices
 from l2dgs_jax.runtime.memory import memory_errors
 from l2dgs_jax.training import DivergedError, Progress
 
@@ -30,6 +34,7 @@ def fit_in_folder(
     display: Display,
     stopping: Callable[[], int | None],
     device_count: int | None = None,
+    with_previews: bool = False,
 ) -> Run:
     """`fit` with everything recorded that it takes to go on; a training that diverges goes back and on at lower rates.
 
@@ -41,6 +46,7 @@ def fit_in_folder(
         display: told how it goes.
         stopping: asked after every step for a signal that wants it to stop.
         device_count: see `fit`.
+        with_previews: whether to leave pictures of two views, now and then.
 
     Raises:
         Interrupted: a signal wanted it to stop; its last step is in a checkpoint.
@@ -48,11 +54,11 @@ def fit_in_folder(
     """
     while True:
         try:
-            return _fit(folder, dataset, config, start, display, stopping, device_count)
+            return _fit(folder, dataset, config, start, display, stopping, device_count, with_previews)
         except DivergedError as error:
             if start.halvings == HALVINGS or jax.process_count() > 1:
                 raise UserError(
-                    f"{folder}: {error}; expected finite values: train anew with lower learning rates", DIVERGED
+                    f"{folder}: {error}; expected a loss that falls: train anew with lower learning rates", DIVERGED
                 ) from None
             reason = str(error)
         halve_rates(folder, start.halvings + 1)
@@ -70,15 +76,27 @@ def _fit(
     display: Display,
     stopping: Callable[[], int | None],
     device_count: int | None,
+    with_previews: bool,
 ) -> Run:
     done = int(start.state.step)
     record = Recorder(folder, config, done, start.halvings)
+    previews.drop_after(folder, done)
+    drawn_at = previews.moments(config) if with_previews else frozenset()
+    losses = [line["loss"] for line in read_metrics(folder)]
+    pace = Pace(config, done, int(start.state.scene.alive.sum()))
 
     def on_step(progress: Progress) -> None:
         line = record(progress)
-        display("step", step=record.step, stage=config.stage_of(record.step))
+        display("step", step=record.step, stage=config.stage_of(record.step), left=pace(record.step))
         if line:
             display("metrics", **line)
+            losses.append(line["loss"])
+            grown = explosion(losses)
+            if grown and jax.process_count() == 1:
+                raise DivergedError(f"by step {record.step} the loss has grown {grown:.0f}-fold", progress)
+        if record.step in drawn_at:
+            files = previews.draw(folder, dataset, config, devices.member(progress.states, 0))
+            display("previews", step=record.step, files=[str(file.relative_to(folder)) for file in files])
         if record.step == config.coarse_steps < config.steps:
             display("compiling", stage="fine")
         signal_number = stopping()

@@ -3,6 +3,9 @@
 import json
 import time
 from pathlib import Path
+from typing import Any
+
+import jax
 
 from l2dgs_jax.config import Config
 from l2dgs_jax.runs import checkpoints
@@ -11,9 +14,19 @@ from l2dgs_jax.runs.divergence import rate_factor
 from l2dgs_jax.runs.folder import CHECKPOINT, COARSE, METRICS, read_metrics
 from l2dgs_jax.runtime import devices
 from l2dgs_jax.runtime.files import append_line, replacing
+from l2dgs_jax.runtime.memory import memory_in_use
 from l2dgs_jax.training import Progress
+from l2dgs_jax.training.optimizer import learning_rates
 
 LOG_EVERY = 10  # steps between lines of the metrics file
+
+# Of a line, beside the terms of the loss.
+_FACTS = ("step", "stage", "gaussians", "pairs", "loss", "psnr", "rate_factor", "rates", "memory", "seconds")
+
+
+def terms(line: dict[str, Any]) -> dict[str, float]:
+    """The terms of the loss in a line of metrics."""
+    return {name: value for name, value in line.items() if name not in _FACTS}
 
 
 class Recorder:
@@ -76,7 +89,10 @@ class Recorder:
     def _line(self, progress: Progress, member: int) -> dict:
         report = devices.member(progress.report, member)
         alive = devices.member(progress.states.scene.alive, member)
+        adam = progress.states.adam
+        rates = jax.device_get(learning_rates(*devices.member((adam.schedules, adam.step), member)))
         values = {"loss": report.loss, "psnr": report.psnr, **report.terms}
+        memory = memory_in_use()
         return {
             "step": progress.step,
             "stage": self.config.stage_of(progress.step),
@@ -84,5 +100,7 @@ class Recorder:
             "pairs": int(report.pairs),
             **{name: round(float(value), 6) for name, value in values.items()},
             "rate_factor": rate_factor(self.halvings),
+            "rates": {name: float(f"{float(rate):.3g}") for name, rate in rates.items()},
+            "memory": None if memory is None else round(memory / 2**30, 3),
             "seconds": round(time.monotonic() - self.begun, 2),
         }

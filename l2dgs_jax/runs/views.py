@@ -13,18 +13,22 @@ from l2dgs_jax.runtime.prefetch import prefetch
 from l2dgs_jax.types import Camera, RenderOutput
 
 
-def views(run: Run, cameras: Camera, size: tuple[int, int] | None = None) -> Iterator[RenderOutput]:
-    """Render a batch of cameras in order, as NumPy arrays, showing progress.
+def views(
+    run: Run, cameras: Camera, size: tuple[int, int] | None = None, quiet: bool = False
+) -> Iterator[RenderOutput]:
+    """Render a batch of cameras in order, as NumPy arrays, showing progress on a terminal.
 
     Args:
         run: the run.
         cameras: the batch.
         size: width and height of the images, pixels; the data set's if not given.
+        quiet: show no progress.
     """
     renderer = run.renderer(*size or (None, None))
     count = len(cameras.time)
     outputs = prefetch(lambda i: jax.device_get(renderer(select_camera(cameras, i))), range(count))
-    yield from tqdm(outputs, total=count, desc="render", unit="view", dynamic_ncols=True, disable=None)
+    hidden = quiet or None  # None: where there is no terminal
+    yield from tqdm(outputs, total=count, desc="render", unit="view", dynamic_ncols=True, disable=hidden)
 
 
 def get_split(run: Run, name: str) -> Split:

@@ -16,6 +16,8 @@ from l2dgs_jax.runtime import devices
 
 T = TypeVar("T")
 
+HELP = frozenset({"-h", "--help"})
+
 
 def run(
     command: Callable[[Sequence[str]], None], arguments: Sequence[str] | None = None, *, huge_pages: bool = False
@@ -27,7 +29,7 @@ def run(
         arguments: those of the command line if not given.
         huge_pages: for commands that compute for long; makes the program start twice.
     """
-    if huge_pages and not {"-h", "--help"} & set(sys.argv):
+    if huge_pages and not HELP & set(sys.argv):
         use_huge_pages()
     devices.use_atomic_additions()
     use_compilation_cache()

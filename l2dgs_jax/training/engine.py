@@ -64,7 +64,7 @@ class Progress(NamedTuple):
 
 
 class DivergedError(ArithmeticError):
-    """The loss or a gradient of every member is not finite. `progress` is the step that found the last of them so."""
+    """No member can go on: the last of them was found to diverge at the step `progress`."""
 
     def __init__(self, message: str, progress: Progress):
         super().__init__(message)

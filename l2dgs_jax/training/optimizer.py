@@ -50,6 +50,12 @@ def learning_rate(schedule: Schedule, count: Int[Array, "*S"]) -> Float[Array, "
     return jnp.where(schedule.start > 0, start * (schedule.end / start) ** progress, 0.0)
 
 
+@jax.jit
+def learning_rates(schedules: dict[str, Schedule], count: Int[Array, "*S"]) -> dict[str, Float[Array, "*S"]]:
+    """The rate of every group after so many steps."""
+    return {name: learning_rate(schedule, count) for name, schedule in schedules.items()}
+
+
 def adam(
     groups: PyTree,
     rates: dict[str, Schedule],

@@ -21,12 +21,13 @@ SECONDS = 4
 SAMPLES = 8  # views that decide the range of colours
 
 
-def write_run_video(run: Run, stem: Path) -> Path:
+def write_run_video(run: Run, stem: Path, *, quiet: bool = False) -> Path:
     """A short flight through space and time: the estimate of the dark input on the left, well-lit on the right.
 
     Args:
         run: the run.
         stem: the file without its ending.
+        quiet: show no progress.
 
     Returns:
         The file.
@@ -35,7 +36,7 @@ def write_run_video(run: Run, stem: Path) -> Path:
         UserError: the file cannot be written.
     """
     cameras = space_time_path(run.dataset.train.cameras, SECONDS * RATE)
-    return write_videos(run, cameras, {stem: ("lowlight", "welllit")})[0]
+    return write_videos(run, cameras, {stem: ("lowlight", "welllit")}, quiet=quiet)[0]
 
 
 def write_videos(
@@ -45,6 +46,7 @@ def write_videos(
     *,
     size: tuple[int, int] | None = None,
     fps: float | int = RATE,
+    quiet: bool = False,
 ) -> list[Path]:
     """Write videos of the same cameras, whole or not at all.
 
@@ -54,6 +56,7 @@ def write_videos(
         shown: by the file without its ending, what is side by side in it.
         size: width and height of each of these pictures, pixels; the data set's if not given.
         fps: frames a second.
+        quiet: show no progress.
 
     Returns:
         The files.
@@ -67,7 +70,7 @@ def write_videos(
         videos = []
         for stem, kinds in shown.items():
             videos.append((stack.enter_context(open_video(stem, (len(kinds) * width, height), fps)), kinds))
-        for output in views(run, cameras, size):
+        for output in views(run, cameras, size, quiet):
             for add, kinds in videos:
                 add(display.side_by_side(output, kinds, ranges))
     return [video_path(stem) for stem in shown]

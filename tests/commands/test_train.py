@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -270,6 +271,44 @@ def test_what_cannot_start_leaves_no_folder(refuses, scene, tmp_path, monkeypatc
     with pytest.raises(ValueError, match="at least 2 cells"):
         train.main([str(scene), "--model.plane-size=1", "--output", str(tmp_path / "run")])
     assert not (tmp_path / "run").exists()
+
+
+def test_options_of_the_run_are_read_with_every_preset(scene, tmp_path):
+    flags = ["--quiet", "--json", "--no-report", "--tensorboard", "--devices=1"]
+    options = train._parse([str(scene), *flags, "--preset=fast", "--output", str(tmp_path / "run"), "--fine-steps=7"])
+    assert (options.quiet, options.json, options.report, options.tensorboard) == (True, True, False, True)
+    assert (options.devices, options.config.fine_steps, options.config.coarse_steps) == (1, 7, 100)
+    assert not options.resume
+
+
+def shown_default(capsys, arguments, option):
+    with pytest.raises(SystemExit) as caught:
+        train.main(arguments)
+    assert caught.value.code == 0
+    boxes = capsys.readouterr().out.split(f" {option} ")[1]
+    return re.search(r"\(default: (\S+)\)", boxes)[1]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "preset"),
+    [
+        (["--help"], "default"),
+        (["nonsuch", "-h"], "default"),
+        (["demo", "--help"], "demo"),
+        (["--preset", "paper", "--help"], "paper"),
+        (["--help", "demo", "--preset=best"], "best"),
+    ],
+)
+def test_help_shows_the_settings_of_the_preset(capsys, arguments, preset):
+    config = PRESETS[preset]
+    assert shown_default(capsys, arguments, "--preset") == preset
+    assert shown_default(capsys, arguments, "--fine-steps") == str(config.fine_steps)
+    assert shown_default(capsys, arguments, "--model.tone") == config.model.tone
+    assert shown_default(capsys, arguments, "--optim.heads-lr") == str(config.optim.heads_lr)
+
+
+def test_help_on_an_unknown_preset(refuses):
+    refuses("--preset", "nonsuch", "--help", naming=["nonsuch", "default", "paper"])
 
 
 def test_an_unknown_option_is_refused(capsys, scene):

@@ -12,12 +12,11 @@ LINE = {"step": 10, "stage": "coarse", "gaussians": 7, "loss": 0.5, "psnr": 30.0
 
 
 def show(display, steps=40):
-    """A training of which every step takes a second, and compiling takes a minute."""
+    """A training of which every step takes a second."""
     display("begin", step=0, steps=steps)
     display("compiling", stage="coarse")
-    display.passes(60)
     for step in range(1, steps + 1):
-        display("step", step=step, stage="coarse")
+        display("step", step=step, stage="coarse", left=3.0 * (steps - step) if step > 1 else None)
         if step % 10 == 0:
             display("metrics", **LINE | {"step": step})
         display.passes(1)
@@ -45,7 +44,7 @@ def test_a_log_has_a_line_now_and_then_and_the_time_left(monkeypatch, capsys):
     assert output == ""
     assert errors.splitlines() == [
         "compiling the coarse stage",
-        "coarse 10/40: loss 0.500, low-light 30.0 dB, 7 Gaussians, 00:30 left",
+        "coarse 10/40: loss 0.500, low-light 30.0 dB, 7 Gaussians, 01:30 left",
         "coarse 40/40: loss 0.500, low-light 30.0 dB, 7 Gaussians",
         "going back",
     ]
@@ -84,12 +83,15 @@ def test_a_terminal_has_a_bar(monkeypatch):
         display("begin", step=10, steps=40)
         display("compiling", stage="fine")
         assert "compiling the fine stage:  25%" in terminal.getvalue()
-        display("step", step=11, stage="fine")
+        display("step", step=11, stage="fine", left=None)
         display("metrics", **LINE)
         assert "30.0 dB" in terminal.getvalue().split("\r")[-1]
+        display("step", step=12, stage="fine", left=754.0)
+        display("metrics", **LINE)
+        assert "<12:34" in terminal.getvalue().split("\r")[-1]
         display("diverged", message="going back")
         display("begin", step=0, steps=40)
-        display("step", step=1, stage="coarse")
+        display("step", step=1, stage="coarse", left=None)
         assert display.bar.n == 1
     assert "going back" in terminal.getvalue()
 

@@ -13,7 +13,7 @@ import signal
 import jax
 import jax.numpy as jnp
 import pytest
-from tiny_training import assert_equal_states, make_dataset, tiny
+from tiny_training import assert_equal_states, make_dataset, report, tiny
 
 from l2dgs_jax import runs
 from l2dgs_jax.config import DensityConfig
@@ -21,7 +21,6 @@ from l2dgs_jax.errors import DISK_FULL, DIVERGED, OUT_OF_MEMORY, Interrupted, Us
 from l2dgs_jax.runs import checkpoints, folder, persistence, recorder
 from l2dgs_jax.runs.divergence import standing
 from l2dgs_jax.training import engine, initial_state
-from l2dgs_jax.training.step import StepReport
 
 CONFIG = tiny(checkpoint_every=3, density=DensityConfig(start=1, stop=0))
 STEPS = CONFIG.steps
@@ -30,11 +29,6 @@ STEPS = CONFIG.steps
 @pytest.fixture(scope="module")
 def dataset():
     return make_dataset()
-
-
-def report():
-    zero, no = jnp.zeros(1), jnp.zeros(1, bool)
-    return StepReport(zero, {"l1": zero}, zero, jnp.zeros(1, jnp.int32), no, no)
 
 
 def count(states, batches, values, number, *, config, **_):
@@ -73,16 +67,16 @@ class Watcher:
         return signal.SIGTERM if self.reached == self.stop_after else None
 
 
-def go_on(place, dataset, watcher=None):
+def go_on(place, dataset, watcher=None, config=CONFIG):
     """Train in a folder from where it stands to the end."""
     watcher = watcher or Watcher()
-    start = standing(place, dataset, CONFIG)
-    return persistence.fit_in_folder(place, dataset, CONFIG, start, watcher, watcher.stopping, 1)
+    start = standing(place, dataset, config)
+    return persistence.fit_in_folder(place, dataset, config, start, watcher, watcher.stopping, 1)
 
 
 def metrics(place):
     lines = [json.loads(line) for line in (place / runs.METRICS).read_text().splitlines()]
-    return [{name: value for name, value in line.items() if name != "seconds"} for line in lines]
+    return [{name: value for name, value in line.items() if name not in ("seconds", "memory")} for line in lines]
 
 
 class KilledError(BaseException):
@@ -291,8 +285,42 @@ def dying_after(step, put_back_first):
 def test_a_training_that_lower_rates_do_not_help_is_given_up(dataset, tmp_path, monkeypatch):
     monkeypatch.setattr(engine, "train_steps", diverging(at=1, below=0.0))
     watcher = Watcher()
-    with pytest.raises(UserError, match=r"not finite at step 1 .*; expected finite values") as caught:
+    with pytest.raises(UserError, match=r"not finite at step 1 .*; expected a loss that falls") as caught:
         go_on(tmp_path, dataset, watcher)
     assert caught.value.code == DIVERGED
     assert put_back(watcher) == [(0, 0.5), (0, 0.25), (0, 0.125)]
     assert not checkpoints.kept(tmp_path / runs.CHECKPOINT)
+
+
+LONG = tiny(fine_steps=20, checkpoint_every=3, density=DensityConfig(start=1, stop=0))
+
+
+def exploding(losses, below):
+    """Steps of those losses, ten times as large from step 14 on unless rates are below that part of the first."""
+
+    def take(states, batches, values, number, **rest):
+        fast = states.adam.schedules["means"].start[0] >= below * LONG.optim.means_lr * 1.01
+        after, _, tally = count(states, batches, values, number, **rest)
+        return after, report(losses[number] * (10 if fast and number >= 13 else 1)), tally
+
+    return take
+
+
+@pytest.mark.parametrize(("below", "returns"), [(0.5, [(15, 0.5)]), (0.25, [(15, 0.5), (12, 0.25)])])
+def test_a_loss_that_explodes_is_put_back_before_it(dataset, tmp_path, monkeypatch, below, returns):
+    monkeypatch.setattr(recorder, "LOG_EVERY", 1)
+    losses = [1 / (1 + 0.1 * step) for step in range(LONG.steps)]
+    monkeypatch.setattr(engine, "train_steps", exploding(losses, below))
+    watcher = Watcher()
+    go_on(tmp_path, dataset, watcher, LONG)
+    assert put_back(watcher) == returns
+    assert "by step 16 the loss has grown 8-fold" in next(f["message"] for e, f in watcher.told if "message" in f)
+    assert metrics(tmp_path)[-1]["step"] == LONG.steps
+
+
+def test_a_loss_that_explodes_at_any_rate_is_given_up(dataset, tmp_path, monkeypatch):
+    monkeypatch.setattr(recorder, "LOG_EVERY", 1)
+    monkeypatch.setattr(engine, "train_steps", exploding([1.0] * LONG.steps, below=0.0))
+    with pytest.raises(UserError, match=r"by step 1\d the loss has grown 10-fold; expected a loss") as caught:
+        go_on(tmp_path, dataset, config=LONG)
+    assert caught.value.code == DIVERGED

@@ -1,11 +1,11 @@
-"""Running out of memory, said in one sentence."""
+"""How much memory is in use, and running out of it, said in one sentence."""
 
 import jax
 import numpy as np
 import pytest
 
 from l2dgs_jax.errors import OUT_OF_MEMORY, UserError
-from l2dgs_jax.runtime.memory import memory_errors
+from l2dgs_jax.runtime.memory import memory_errors, memory_in_use
 
 
 @pytest.mark.parametrize("demand", [lambda: np.empty(2**60, np.uint8), lambda: jax.numpy.zeros(2**55, np.uint8)])
@@ -16,6 +16,12 @@ def test_what_numpy_and_jax_raise_is_one_sentence(demand):
     ):
         demand()
     assert caught.value.code == OUT_OF_MEMORY
+
+
+def test_memory_in_use_grows_with_what_is_held():
+    before = memory_in_use()
+    held = np.ones(2**24)
+    assert before + 0.9 * held.nbytes < memory_in_use() < before + 2 * held.nbytes
 
 
 def test_other_errors_of_jax_pass():

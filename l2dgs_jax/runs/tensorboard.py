@@ -1,0 +1,69 @@
+"""A training as events for TensorBoard, written by tensorboardX."""
+
+from pathlib import Path
+from typing import Any
+
+from l2dgs_jax.data.images import read_image, to_bytes
+from l2dgs_jax.errors import UserError
+from l2dgs_jax.runs import previews
+from l2dgs_jax.runs.recorder import terms
+
+EVENTS = "tensorboard"  # folder in that of the run
+FLUSH = 10  # seconds between writings
+
+
+class TensorBoard:
+    """A display (see `displays`) that leaves the metrics as scalars, and the previews as images."""
+
+    def __init__(self, folder: Path):
+        """Write nothing before the first event.
+
+        Args:
+            folder: of the run.
+
+        Raises:
+            UserError: tensorboardX is not installed.
+        """
+        self.folder, self.library, self.writer = folder, tensorboardx(), None
+
+    def __call__(self, event: str, **facts: Any) -> None:
+        """Write what the event tells."""
+        if event in ("begin", "end") and self.writer:
+            self.writer.close()
+            self.writer = None
+        if event == "begin":
+            # Later steps that were written are of before the run was interrupted or put back.
+            lost = facts["step"] + 1
+            self.writer = self.library.SummaryWriter(
+                str(self.folder / EVENTS), purge_step=lost, filename_suffix=f".{lost}", flush_secs=FLUSH
+            )
+        elif event == "metrics" and self.writer:
+            for name, value in _scalars(facts).items():
+                self.writer.add_scalar(name, value, facts["step"])
+        elif event == "previews" and self.writer:
+            for view, kind, step, path in previews.kept(self.folder):
+                if step == facts["step"]:
+                    self.writer.add_image(f"{view}/{kind}", to_bytes(read_image(path)), step, dataformats="HWC")
+
+
+def tensorboardx() -> Any:
+    """The package, which is not part of the plain installation.
+
+    Raises:
+        UserError: it is not installed.
+    """
+    try:
+        import tensorboardX
+    except ImportError:
+        raise UserError(
+            '--tensorboard: tensorboardX is not installed; expected its extra: pip install "l2dgs-jax[tensorboard]"'
+        ) from None
+    return tensorboardX
+
+
+def _scalars(line: dict[str, Any]) -> dict[str, float]:
+    """Numbers of a line of metrics by their tags."""
+    found = {name: line[name] for name in ("loss", "psnr", "gaussians", "memory")}
+    found |= {f"terms/{name}": value for name, value in terms(line).items()}
+    found |= {f"rates/{name}": value for name, value in line["rates"].items()}
+    return {name: value for name, value in found.items() if value is not None}

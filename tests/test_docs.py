@@ -1,0 +1,85 @@
+"""The README and the pages of the documentation: what they tell to type is run as printed.
+
+Trainings are shortened in one way: they have the options of `SHORT`, their steps only count, and they draw no pictures.
+SCENE and the demo are a tiny scene, RUN and runs/demo a tiny run.
+"""
+
+import importlib
+import re
+import shlex
+import shutil
+from pathlib import Path
+
+import finished_run
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scenes import write_nerfies
+from tiny_training import report
+
+from l2dgs_jax import train
+from l2dgs_jax.__main__ import COMMANDS
+from l2dgs_jax.data import demo
+from l2dgs_jax.study.spec import read
+from l2dgs_jax.training import engine
+
+ROOT = Path(__file__).parents[1]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+SHORT = ["--coarse-steps=0", "--fine-steps=2", "--model.plane-size=4", "--model.plane-scales=1", "--model.hidden=8"]
+SHORT += ["--model.plane-channels=2", "--model.no-tracks", "--inbetweens=0", "--no-report"]
+# Not run: what installs; what finds poses, trains studies or chooses kernels, as their own tests do; and what wants
+# several hosts, weights that are not here, or hours.
+INSTALLS = ("git ", "cd ", "pip ", "pytest", "pre-commit")
+LEFT_OUT = ("prepare", "sweep", "L2DGS_JAX_KERNELS", "XLA_FLAGS", "--weights", "experiments")
+
+
+def blocks(page, language):
+    found = re.findall(rf"^( *)```{language}\n(.*?)^\1```", page.read_text(), re.S | re.M)
+    return [re.sub(rf"^{indent}", "", block, flags=re.M) for indent, block in found]
+
+
+def programs(page):
+    """The commands that a page tells to type, as words."""
+    for block in blocks(page, "sh"):
+        for line in block.replace("\\\n", " ").splitlines():
+            for command in map(str.strip, line.split("&&")):
+                if not command.startswith(INSTALLS) and not any(part in command for part in LEFT_OUT):
+                    yield shlex.split(command, comments=True)
+
+
+def test_every_command_of_the_documentation_is_one_of_the_package():
+    typed = [words for page in PAGES for words in programs(page) if words]
+    assert len(typed) > 25
+    for python, option, module, *_ in typed:
+        assert (python, option) == ("python", "-m")
+        assert module.removeprefix("l2dgs_jax.") in COMMANDS
+
+
+def counted(states, *_, **__):
+    return states._replace(step=states.step + 1), report(), engine.Tally(jnp.int32(0), jnp.int32(1))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", [page for page in PAGES if any(programs(page))], ids=lambda page: page.stem)
+def test_what_a_page_tells_to_type_runs(page, tmp_path_factory, tmp_path, monkeypatch):
+    run = finished_run.folder(tmp_path_factory.getbasetemp() / "docs")
+    monkeypatch.chdir(tmp_path)
+    write_nerfies(tmp_path / "SCENE", finished_run.FRAMES, finished_run.WIDTH, finished_run.HEIGHT, num_points=40)
+    for name in ("RUN", "runs/demo"):
+        shutil.copytree(run, name)
+    monkeypatch.setattr(demo, "FOLDER", tmp_path / "SCENE")
+    monkeypatch.setattr(engine, "train_steps", counted)
+    monkeypatch.setattr(train, "contact_sheet", lambda run: np.zeros((8, 8, 3), np.uint8))
+    monkeypatch.setattr(train, "write_run_video", lambda run, stem, quiet: stem)
+    for _, _, module, *arguments in programs(page):
+        training = module.endswith("train") and "--resume" not in arguments
+        for place in ("OUT", "RUN") if training else ("OUT",):  # pages show several commands that fill the same one
+            shutil.rmtree(place, ignore_errors=True)
+        importlib.import_module(module).main([*arguments, *(SHORT if training else [])])
+
+
+def test_the_study_of_the_documentation_is_one(tmp_path):
+    (study,) = blocks(ROOT / "docs" / "studies.md", "toml")
+    (tmp_path / "study.toml").write_text(study)
+    write_nerfies(tmp_path / "my" / "scene")
+    assert len(read(tmp_path / "study.toml").plans) == 16
