@@ -49,7 +49,6 @@ def _presets() -> dict[str, Config]:
         model=ModelConfig(
             unit="depth",
             motion_gate=True,
-            moving_share=0.3,
             tracks=True,
             hidden=64,
             plane_scales=(1, 2),
