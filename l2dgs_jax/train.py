@@ -200,7 +200,7 @@ def _show_help(arguments: Sequence[str]) -> None:
     preset = _preset(command_line.parse(Train, asked, "train", Train(scene="")))
     # A scene is still wanted: an instance could not be without one.
     shown = functools.partial(Train, preset=preset, hosts=Hosts(), config=PRESETS[preset])
-    command_line.parse(shown, ["--help"], "train")  # type: ignore[arg-type]
+    command_line.parse(shown, ["--help"], "train")
 
 
 def _preset(options: Train) -> str:

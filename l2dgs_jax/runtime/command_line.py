@@ -53,13 +53,13 @@ def _show_warning(message: Warning | str, *_: Any) -> None:
     print(f"warning: {message}", file=sys.stderr)
 
 
-def parse(kind: type[T], arguments: Sequence[str], program: str, default: T | None = None) -> T:
-    """Parse command-line arguments into the dataclass `kind`."""
+def parse(kind: Callable[..., T], arguments: Sequence[str], program: str, default: T | None = None) -> T:
+    """Parse command-line arguments into the dataclass `kind`, of which a partial may settle some fields."""
     script = f"l2dgs {program}"
     program = script if sys.argv[0] == script else f"python -m l2dgs_jax.{program}"
     if default is None:
         return tyro.cli(kind, args=arguments, prog=program)
-    return tyro.cli(kind, args=arguments, prog=program, default=default)
+    return tyro.cli(kind, args=arguments, prog=program, default=default)  # type: ignore[call-overload]
 
 
 def use_compilation_cache() -> None:
