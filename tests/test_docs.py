@@ -73,7 +73,8 @@ def test_what_a_page_tells_to_type_runs(page, tmp_path_factory, tmp_path, monkey
     monkeypatch.setattr(train, "write_run_video", lambda run, stem, quiet: stem)
     for _, _, module, *arguments in programs(page):
         training = module.endswith("train") and "--resume" not in arguments
-        for place in ("OUT", "RUN") if training else ("OUT",):  # pages show several commands that fill the same one
+        # Pages show several commands that fill the same folder.
+        for place in {"OUT", "RUN"} & set(arguments) if training else {"OUT"}:
             shutil.rmtree(place, ignore_errors=True)
         importlib.import_module(module).main([*arguments, *(SHORT if training else [])])
 
