@@ -190,7 +190,7 @@ def _initialise(
         illumination_rest=jnp.zeros((count, num_rest)),
         reflectance=random[cfg.reflectance_init](keys[0], (count, 3)) if reflectance is None else reflectance,
         attenuation=random[cfg.attenuation_init](keys[1], (count, 2)),
-        gate=jnp.full(count, OPEN_GATE) if cfg.motion_gate else None,
+        gate=jnp.full(count, OPEN_GATE, float) if cfg.motion_gate else None,
         paths=paths,
         lifetimes=lifetimes,
         color_rest=jnp.zeros((count, 3, num_rest)) if cfg.decomposition == "none" else None,

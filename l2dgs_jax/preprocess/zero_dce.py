@@ -68,7 +68,7 @@ def learn(images: Float[np.ndarray, "F H W 3"], seed: int) -> Net:
     net = init(jax.random.key(seed))
     rate = Schedule(*(jnp.asarray(value, float) for value in (*RATES, STEPS)))
     bar = tqdm(_crops(images, seed), total=STEPS, desc="brighten", unit="step", dynamic_ncols=True, disable=None)
-    for net, _ in train(net, bar, rate, loss):  # noqa: B007, B020
+    for net, _ in train(net, iter(bar), rate, loss):  # noqa: B007, B020
         pass
     return net
 
