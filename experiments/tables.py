@@ -74,7 +74,8 @@ def means(scores: Iterable[Cells]) -> Cells:
     for cells in scores:
         for region, measures in cells.items():
             for measure, value in measures.items():
-                found[region][measure].append(value)
+                if value is not None:
+                    found[region][measure].append(float(value))  # "Infinity" is a string in JSON
     return {
         region: {measure: float(np.mean(values)) for measure, values in measures.items()}
         for region, measures in found.items()
