@@ -68,8 +68,7 @@ def changed(page, before):
 @pytest.mark.skipif(shutil.which("chromium") is None, reason="needs Chromium")
 def test_a_browser_shows_what_its_controls_say(tmp_path):
     command = [sys.executable, "-m", "l2dgs_jax.view", str(lively_run(tmp_path)), "--port", "8917"]
-    heed = lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)  # what runs in a shell's background ignores it
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, preexec_fn=heed) as server:
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
         try:
             address = next(word for line in server.stdout for word in line.split() if word.startswith("http://127"))
             with opened(address, tmp_path / "profile") as tab:
