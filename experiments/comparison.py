@@ -12,14 +12,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import tyro
 from jaxtyping import UInt8
 
 from experiments.web_page import data_url, write_page
 from l2dgs_jax.cameras import select_camera
-from l2dgs_jax.data.images import to_bytes
+from l2dgs_jax.data.images import encode_jpeg, to_bytes
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.runs import open_run
 from l2dgs_jax.runs.views import views
@@ -82,8 +81,7 @@ def _scene(study: Path, scene: str, members: Sequence[dict[str, Any]], count: in
 
 
 def _url(picture: UInt8[np.ndarray, "H W 3"]) -> str:
-    _, content = cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
-    return data_url(content.tobytes(), "picture.jpg")
+    return data_url(encode_jpeg(picture, QUALITY), "picture.jpg")
 
 
 if __name__ == "__main__":

@@ -1,12 +1,12 @@
 """Pages that need no server and no network: HTML from a file beside the script, with all that it shows inside."""
 
 import base64
-import json
 import mimetypes
 from pathlib import Path
 from typing import Any
 
 from l2dgs_jax.runtime.files import replacing
+from l2dgs_jax.runtime.pages import script_json
 
 HOLE = "__DATA__"  # in a script element of the type application/json
 
@@ -18,8 +18,7 @@ def write_page(path: Path, template: Path, data: Any) -> None:
         UserError: the page cannot be written.
     """
     with replacing(path) as temporary:
-        # Nothing in the data may end the script element.
-        temporary.write_text(template.read_text().replace(HOLE, json.dumps(data).replace("</", "<\\/")))
+        temporary.write_text(template.read_text().replace(HOLE, script_json(data)))
 
 
 def data_url(content: bytes, name: str) -> str:

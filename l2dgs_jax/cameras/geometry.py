@@ -20,6 +20,16 @@ def camera_centres(viewmats: AnyArray) -> AnyArray:
     return -(viewmats[..., :3, :3] * viewmats[..., :3, 3:]).sum(-2)
 
 
+def project_points(
+    points: Float[np.ndarray, "*B 3"], viewmats: Float[np.ndarray, "*C 4 4"], Ks: Float[np.ndarray, "*C 3 3"]
+) -> tuple[Float[np.ndarray, "*B 2"], Float[np.ndarray, "*B"]]:
+    """Pixels of points in world units, NaN behind the camera, and their depths; one camera, or one for each point."""
+    local = np.einsum("...ij,...j->...i", viewmats[..., :3, :3], points) + viewmats[..., :3, 3]
+    depth = local[..., 2]
+    seen = np.einsum("...ij,...j->...i", Ks[..., :2, :], local)
+    return seen / np.where(depth > 0, depth, np.nan)[..., None], depth
+
+
 def mean_up(viewmats: Float[np.ndarray, "F 4 4"]) -> Float[np.ndarray, "3"]:
     """The unit vector that cameras hold upwards on average; the first camera's if they do not agree at all."""
     ups = -np.asarray(viewmats[:, 1, :3], np.float64)

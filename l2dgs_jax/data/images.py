@@ -115,6 +115,12 @@ def to_bytes(image: Float[np.ndarray, "*shape"] | Bool[np.ndarray, "*shape"]) ->
     return np.round(np.clip(np.asarray(image, np.float32), 0, 1) * 255).astype(np.uint8)
 
 
+def encode_jpeg(picture: UInt8[np.ndarray, "H W 3"], quality: int) -> bytes:
+    """Content of a JPEG file, of a quality up to 100."""
+    _, content = cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
+    return content.tobytes()
+
+
 def area_average(image: Float32[np.ndarray, "H W C"], factor: int) -> Float32[np.ndarray, "h w C"]:
     """Shrink by a whole factor, each pixel the mean of a block.
 

@@ -2,7 +2,6 @@
 
 import base64
 import html
-import json
 import zlib
 from importlib import resources
 from string import Template
@@ -22,6 +21,7 @@ from l2dgs_jax.exporters.tracks import Tracks
 from l2dgs_jax.kernels.tiles import MAX_ALPHA, MIN_ALPHA
 from l2dgs_jax.rasterizer.projection import EPS_2D, FIELD_MARGIN
 from l2dgs_jax.runs import Run
+from l2dgs_jax.runtime.pages import script_json
 from l2dgs_jax.types import Camera
 
 IMAGES: tuple[Image, ...] = ("welllit", "lowlight")
@@ -77,13 +77,12 @@ def page(run: Run, tracks: Tracks, scores: Float[np.ndarray, "T I"], seconds: fl
     """
     source = resources.files("l2dgs_jax.exporters") / "player"
     read = lambda *names: "\n".join((source / name).read_text("utf-8").strip() for name in names)
-    described = json.dumps(_description(run, tracks, seconds), separators=(",", ":"))
     return Template(read("page.html")).substitute(
         title=html.escape(run.dataset.name),
         summary=SUMMARY,
         information=_information(tracks, scores),
         style=read("style.css"),
-        description=described.replace("<", "\\u003c"),  # nothing in it ends the element that it stands in
+        description=script_json(_description(run, tracks, seconds)),
         data=base64.b64encode(zlib.compress(tracks_of.pack(tracks), 9)).decode(),
         splat_vertex_shader=read("splat.vert"),
         splat_fragment_shader=read("splat.frag"),

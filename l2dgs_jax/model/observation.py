@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
+from l2dgs_jax.cameras.geometry import project_points
 from l2dgs_jax.data.stacks import pixel_mean, stacked
 from l2dgs_jax.runtime.prefetch import prefetch
 from l2dgs_jax.types import Camera
@@ -80,11 +81,9 @@ def _seen(
     viewmat, K, image = np.asarray(cameras.viewmat[frame]), cameras.K[frame], images[frame]
     if blur:
         image = cv2.blur(image.astype(np.float32), (3, 3))
-    x, y, z = K @ (viewmat[:3, :3] @ points.T + viewmat[:3, 3:])
-    depth = np.where(z > 0, z, np.inf)
-    column, row = np.floor(x / depth).astype(int), np.floor(y / depth).astype(int)
-    height, width = image.shape[:2]
-    inside = (z > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    pixels, _ = project_points(points, viewmat, np.asarray(K))
+    inside = ((pixels >= 0) & (pixels < image.shape[1::-1])).all(-1)
+    column, row = np.where(inside, pixels.T, 0).astype(int)
     if valid is not None:
         inside[inside] = valid[frame][row[inside], column[inside]]
     colors = np.full((len(points), 3), np.nan, image.dtype)

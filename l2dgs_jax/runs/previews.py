@@ -11,7 +11,7 @@ from jaxtyping import UInt8
 
 from l2dgs_jax.config import Config
 from l2dgs_jax.data import Dataset
-from l2dgs_jax.data.images import to_bytes
+from l2dgs_jax.data.images import encode_jpeg, to_bytes
 from l2dgs_jax.runs.run import Run
 from l2dgs_jax.runtime.capacity import next_capacity
 from l2dgs_jax.runtime.files import make_folder, replacing
@@ -113,7 +113,6 @@ def _write(path: Path, picture: UInt8[np.ndarray, "H W 3"]) -> None:
     height, width = picture.shape[:2]
     if width > WIDTH:
         picture = cv2.resize(picture, (WIDTH, round(height * WIDTH / width)), interpolation=cv2.INTER_AREA)
-    _, encoded = cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
     make_folder(path.parent)
     with replacing(path) as temporary:
-        temporary.write_bytes(encoded.tobytes())
+        temporary.write_bytes(encode_jpeg(picture, QUALITY))

@@ -3,7 +3,6 @@
 import base64
 import contextlib
 import html
-import json
 import math
 import re
 import time
@@ -16,6 +15,7 @@ from l2dgs_jax.runs import previews
 from l2dgs_jax.runs.folder import CONTACT_SHEET, VIDEO, read_metrics
 from l2dgs_jax.runs.recorder import terms
 from l2dgs_jax.runtime.files import replacing
+from l2dgs_jax.runtime.pages import script_json
 
 REPORT = "report.html"
 INTERVAL = 15  # seconds between two writings
@@ -77,8 +77,7 @@ class Report:
             "curves": curves(self.lines),
             "views": _views(self.folder),
         }
-        data = json.dumps(content).replace("<", "\\u003c")  # lest something in it end the script that holds it
-        parts = {"TITLE": html.escape(self.shown.get("scene", "")), "DATA": data}
+        parts = {"TITLE": html.escape(self.shown.get("scene", "")), "DATA": script_json(content)}
         with replacing(self.folder / REPORT) as temporary:
             temporary.write_text(re.sub("|".join(parts), lambda found: parts[found[0]], TEMPLATE.read_text()))
 

@@ -4,9 +4,9 @@ from pathlib import Path
 from typing import Any
 
 from l2dgs_jax.data.images import read_image, to_bytes
-from l2dgs_jax.errors import UserError
 from l2dgs_jax.runs import previews
 from l2dgs_jax.runs.recorder import terms
+from l2dgs_jax.runtime.extras import extra
 
 EVENTS = "tensorboard"  # folder in that of the run
 FLUSH = 10  # seconds between writings
@@ -47,18 +47,12 @@ class TensorBoard:
 
 
 def tensorboardx() -> Any:
-    """The package, which is not part of the plain installation.
+    """The package.
 
     Raises:
         UserError: it is not installed.
     """
-    try:
-        import tensorboardX
-    except ImportError:
-        raise UserError(
-            '--tensorboard: tensorboardX is not installed; expected its extra: pip install "l2dgs-jax[tensorboard]"'
-        ) from None
-    return tensorboardX
+    return extra("tensorboardX", "tensorboard", "--tensorboard")
 
 
 def _scalars(line: dict[str, Any]) -> dict[str, float]:

@@ -9,6 +9,7 @@ from scipy import sparse
 from scipy.sparse.linalg import cg
 from scipy.spatial import cKDTree
 
+from l2dgs_jax.cameras.geometry import project_points
 from l2dgs_jax.training.tracks import DEPTH_CELL, Tracks
 
 NEIGHBOURS = 30  # points around a pixel that depths are taken from
@@ -44,9 +45,7 @@ def depths_around(
     width: int,
 ) -> Depths:
     """Depths in one frame, of points in world units."""
-    local = points @ viewmat[:3, :3].T + viewmat[:3, 3]
-    local = local[local[:, 2] > 0]
-    pixels = (local @ K.T)[:, :2] / local[:, 2:]
+    pixels, depth = project_points(points, viewmat, K)
     inside = ((pixels > -BESIDE) & (pixels < (width + BESIDE, height + BESIDE))).all(-1)
     rows, columns = (np.arange(0, size, DEPTH_CELL) + 0.5 * DEPTH_CELL for size in (height, width))
     if not inside.any():
@@ -54,7 +53,7 @@ def depths_around(
         return Depths(unknown[1:], unknown[0])
     cells = np.stack(np.meshgrid(columns, rows), axis=-1)
     _, around = cKDTree(pixels[inside]).query(cells, k=range(1, min(NEIGHBOURS, int(inside.sum())) + 1))
-    near, front, far = np.quantile(local[inside, 2][around], (RANGE[0], FRONT, RANGE[1]), axis=-1)
+    near, front, far = np.quantile(depth[inside][around], (RANGE[0], FRONT, RANGE[1]), axis=-1)
     return Depths((1 / np.linspace(1 / near, 1 / far, GUESSES)).astype(np.float32), front.astype(np.float32))
 
 

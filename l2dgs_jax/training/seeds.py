@@ -8,9 +8,9 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Float32, Int
+from jaxtyping import Float, Float32
 
-from l2dgs_jax.cameras.geometry import camera_centres
+from l2dgs_jax.cameras.geometry import camera_centres, project_points
 from l2dgs_jax.data.dataset import Split
 from l2dgs_jax.model.deformation import path_weights
 from l2dgs_jax.model.initialisation import Seeds, path_knots, z_order
@@ -64,11 +64,11 @@ def _worthwhile(tracks: Tracks, cameras: _Cameras, depths: Float32[np.ndarray, "
     lengths = np.diff(starts, append=len(tracks.numbers))
     if not len(starts):
         return []
-    strays = []
+    strays, viewmats, Ks = [], cameras.viewmat[tracks.frames], cameras.K[tracks.frames]
     for depth in depths:
         world = np.repeat(_lift(tracks, cameras, depths_at(tracks, depth))[starts], lengths, axis=0)
-        apart = np.linalg.norm(tracks.pixels - _project(world, tracks.frames, cameras), axis=-1)
-        strays.append(np.maximum.reduceat(apart, starts))
+        still, _ = project_points(world, viewmats, Ks)
+        strays.append(np.maximum.reduceat(np.linalg.norm(tracks.pixels - still, axis=-1), starts))
     moves = np.add.reduceat(tracks.moves, starts) / lengths
     strayed = np.min(strays, axis=0) > STRAY  # not where a depth is NaN
     worth = np.flatnonzero((lengths >= SHORTEST) & (moves > MOVING) & strayed)
@@ -113,13 +113,3 @@ def _lift(tracks: Tracks, cameras: _Cameras, depth: Float[np.ndarray, " O"]) -> 
     homogeneous = np.concatenate([tracks.pixels, np.ones((len(depth), 1))], axis=-1)
     rays = np.einsum("oij,oj->oi", np.linalg.inv(K), homogeneous)
     return camera_centres(viewmat) + np.einsum("oji,oj->oi", viewmat[:, :3, :3], depth[:, None] * rays)
-
-
-def _project(
-    points: Float[np.ndarray, "O 3"], frames: Int[np.ndarray, " O"], cameras: _Cameras
-) -> Float[np.ndarray, "O 2"]:
-    """Pixels of world points in those frames; NaN behind the camera."""
-    viewmat, K = cameras.viewmat[frames], cameras.K[frames]
-    local = np.einsum("oij,oj->oi", viewmat[:, :3, :3], points) + viewmat[:, :3, 3]
-    seen = np.einsum("oij,oj->oi", K, local)
-    return seen[:, :2] / np.where(seen[:, 2:] > 0, seen[:, 2:], np.nan)

@@ -14,6 +14,7 @@ from l2dgs_jax.cameras import reframe
 from l2dgs_jax.cameras.geometry import mean_up
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.runs.run import Run
+from l2dgs_jax.runtime.extras import extra
 from l2dgs_jax.viewer.guest import Guest
 from l2dgs_jax.viewer.ladder import ladder
 from l2dgs_jax.viewer.renderers import Renderers
@@ -22,21 +23,6 @@ from l2dgs_jax.viewer.turns import Turns
 from l2dgs_jax.visualize import films
 
 USUAL_WINDOW = 1280, 720  # pixels
-
-
-def viser() -> Any:
-    """The package, which is not part of the plain installation.
-
-    Raises:
-        UserError: it is not installed.
-    """
-    try:
-        import viser
-    except ImportError:
-        raise UserError(
-            'viser is not installed; expected the extra for viewing: pip install "l2dgs-jax[view]"'
-        ) from None
-    return viser
 
 
 @contextlib.contextmanager
@@ -56,7 +42,7 @@ def serve(run: Run, host: str, port: int) -> Iterator[int]:
     Raises:
         UserError: viser is not installed, or there is no listening at that address.
     """
-    library = viser()
+    library = extra("viser", "view", "viewing")
     _check_address(host)
     turns, guests = Turns(), dict[int, Guest]()
 

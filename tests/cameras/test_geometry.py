@@ -7,7 +7,7 @@ from jax.test_util import check_grads
 from scipy.spatial.transform import Rotation
 
 from l2dgs_jax.cameras import camera_centres, camera_extent, median_depth, reframe, resize, select_camera
-from l2dgs_jax.cameras.geometry import mean_up
+from l2dgs_jax.cameras.geometry import mean_up, project_points
 from l2dgs_jax.types import Camera
 
 
@@ -45,6 +45,19 @@ def test_cameras_all_around_agree_on_up():
     np.testing.assert_allclose(mean_up(viewmats), world.apply([0, -1, 0]), atol=1e-12)  # y points down
     upside_down = np.diag([-1, -1, 1, 1]) @ viewmats[:1]
     np.testing.assert_allclose(np.linalg.norm(mean_up(np.concatenate([viewmats[:1], upside_down]))), 1)
+
+
+@pytest.mark.parametrize("of", [lambda batch: select_camera(batch, 2), lambda batch: batch], ids=["one", "each"])
+def test_points_project_to_where_their_rays_came_from(of):
+    camera = of(cameras(CENTRES))
+    pixels, depths = np.random.default_rng(2).uniform(1, 20, (5, 2)), np.array([0.5, 1, 3, 9, -2])
+    rays = np.einsum("...ij,...j->...i", np.linalg.inv(camera.K), np.concatenate([pixels, np.ones((5, 1))], -1))
+    axes = camera.viewmat[..., :3, :3].swapaxes(-1, -2)
+    points = camera_centres(camera.viewmat) + np.einsum("...ij,...j->...i", axes, depths[:, None] * rays)
+    found, depth = project_points(points, camera.viewmat, camera.K)
+    np.testing.assert_allclose(depth, depths)
+    np.testing.assert_allclose(found[:4], pixels[:4])
+    assert np.isnan(found[4]).all()  # behind the camera
 
 
 def test_a_resized_camera_sees_the_same():

@@ -165,9 +165,7 @@ def events(path):
 
 def test_without_the_extra_tensorboard_is_refused_in_one_sentence(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "tensorboardX", None)
-    with pytest.raises(
-        UserError, match=r'^--tensorboard: .* expected its extra: pip install "l2dgs-jax\[tensorboard\]"$'
-    ):
+    with pytest.raises(UserError, match=r'^tensorboardX .* for --tensorboard: pip install "l2dgs-jax\[tensorboard\]"$'):
         TensorBoard(tmp_path)
 
 

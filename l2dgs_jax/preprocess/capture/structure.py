@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 from tqdm import tqdm
 
-from l2dgs_jax.errors import UserError
+from l2dgs_jax.runtime.extras import extra
 
 CameraModel = Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"]
 
@@ -43,19 +43,14 @@ class Workplace:
 
 
 def pycolmap() -> Any:
-    """The package, which is not part of the plain installation.
+    """The package, told to be quiet.
 
     Raises:
         UserError: it is not installed.
     """
-    try:
-        import pycolmap
-    except ImportError:
-        raise UserError(
-            'pycolmap is not installed; expected the extra for structure from motion: pip install "l2dgs-jax[sfm]"'
-        ) from None
-    pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)
-    return pycolmap
+    package = extra("pycolmap", "sfm", "structure from motion")
+    package.logging.minloglevel = int(package.logging.ERROR)
+    return package
 
 
 def find_features(workplace: Workplace, names: Sequence[str], camera_model: CameraModel) -> None:

@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Float32, UInt8
 
 from l2dgs_jax.cameras.epipolar import EpipolarGeometry, epipolar_geometry, project, static_residuals
 from l2dgs_jax.cameras.flow import LOST, Matches, brightened, match, optical_flow, pixel_indices
+from l2dgs_jax.cameras.geometry import project_points
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.types import Camera
 
@@ -159,8 +160,6 @@ def _visible(
 ) -> tuple[Float[np.ndarray, "V 2"], Float[np.ndarray, " V"]]:
     """Pixels and depths of the points within a frame's picture."""
     viewmat, K = (np.asarray(x[frame], np.float64) for x in (cameras.viewmat, cameras.K))
-    local = points.astype(np.float64) @ viewmat[:3, :3].T + viewmat[:3, 3]
-    local = local[local[:, 2] > 0]
-    pixels = (local @ K.T)[:, :2] / local[:, 2:]
+    pixels, depth = project_points(points.astype(np.float64), viewmat, K)
     inside = ((pixels >= 0) & (pixels < size)).all(-1)
-    return pixels[inside], local[inside, 2]
+    return pixels[inside], depth[inside]
