@@ -43,8 +43,13 @@ def main(arguments: Sequence[str]) -> None:
     with serve(run, options.host, options.port) as port:
         print(f"open http://{options.host}:{port} in a browser; Ctrl-C ends it")
         print(f"from another machine: ssh -L {port}:{options.host}:{port} {socket.gethostname()}", flush=True)
-        with contextlib.suppress(KeyboardInterrupt):
-            threading.Event().wait()
+        until_interrupted()
+
+
+def until_interrupted() -> None:
+    """Wait for Ctrl-C."""
+    with contextlib.suppress(KeyboardInterrupt):
+        threading.Event().wait()
 
 
 if __name__ == "__main__":

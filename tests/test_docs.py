@@ -1,7 +1,7 @@
 """The README and the pages of the documentation: what they tell to type is run as printed.
 
 Trainings are shortened in one way: they have the options of `SHORT`, their steps only count, and they draw no pictures.
-SCENE and the demo are a tiny scene, RUN and runs/demo a tiny run.
+SCENE and the demo are a tiny scene, RUN and runs/demo a tiny run; and nobody stays to look at the viewer.
 """
 
 import importlib
@@ -17,7 +17,7 @@ import pytest
 from scenes import write_nerfies
 from tiny_training import report
 
-from l2dgs_jax import train
+from l2dgs_jax import train, view
 from l2dgs_jax.__main__ import COMMANDS
 from l2dgs_jax.data import demo
 from l2dgs_jax.study.spec import read
@@ -71,6 +71,7 @@ def test_what_a_page_tells_to_type_runs(page, tmp_path_factory, tmp_path, monkey
     monkeypatch.setattr(engine, "train_steps", counted)
     monkeypatch.setattr(train, "contact_sheet", lambda run: np.zeros((8, 8, 3), np.uint8))
     monkeypatch.setattr(train, "write_run_video", lambda run, stem, quiet: stem)
+    monkeypatch.setattr(view, "until_interrupted", lambda: None)
     for _, _, module, *arguments in programs(page):
         training = module.endswith("train") and "--resume" not in arguments
         # Pages show several commands that fill the same folder.

@@ -54,7 +54,7 @@ def start(study, tmp_path_factory):
     cache = str(tmp_path_factory.mktemp("cache"))
 
     def run(output, *arguments, devices=1, path=study):
-        flags = f"--xla_force_host_platform_device_count={devices}"
+        flags = f"--xla_force_host_platform_device_count={devices} --xla_backend_optimization_level=0"
         environment = os.environ | {"L2DGS_JAX_CACHE": cache, "PYTHONWARNINGS": "ignore", "XLA_FLAGS": flags}
         command = [sys.executable, "-m", "l2dgs_jax.sweep", str(path), str(output), *map(str, arguments)]
         return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
