@@ -4,7 +4,7 @@ import contextlib
 import dataclasses
 import functools
 import shlex
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -31,7 +31,9 @@ from l2dgs_jax.runtime.files import is_taken, new_folder
 from l2dgs_jax.runtime.locks import locked
 from l2dgs_jax.runtime.memory import memory_errors
 from l2dgs_jax.runtime.signals import stop_requests
-from l2dgs_jax.training import initial_state, resolve
+from l2dgs_jax.training import Progress, initial_state, resolve
+from l2dgs_jax.viewer.live import live
+from l2dgs_jax.viewer.server import check
 from l2dgs_jax.visualize import contact_sheet, write_run_video
 
 _Flag = tyro.conf.FlagCreatePairsOff[bool]
@@ -55,6 +57,9 @@ class Train:
         json: print one JSON object a line, docs/training.md says which.
         report: leave out report.html, a page in the run folder that shows how it goes.
         tensorboard: write events for TensorBoard to the run folder; wants the extra of that name.
+        view: show the scene in the browser while it trains; wants the extra of that name.
+        view_host: address to show it at; 0.0.0.0 lets every machine of the network in.
+        view_port: port to show it at, or the next that is free.
         hosts: several processes.
     """
 
@@ -67,6 +72,9 @@ class Train:
     json: _Flag = False
     report: _Flag = True
     tensorboard: _Flag = False
+    view: _Flag = False
+    view_host: str = "127.0.0.1"
+    view_port: int = 8080
     hosts: Annotated[Hosts, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Hosts)
     config: Annotated[Config, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Config)
 
@@ -86,6 +94,8 @@ def _train(options: Train) -> None:
     _check_devices(options)
     if options.tensorboard:
         tensorboardx()
+    if options.view:
+        check(options.view_host, options.view_port, "view-")
     with contextlib.ExitStack() as stack:
         if options.resume and first:
             stack.enter_context(locked(folder))
@@ -149,10 +159,13 @@ def _fit(dataset: Dataset, options: Train, config: Config, start: Checkpoint, di
     notice = "stopping after this step; Ctrl-C now stops at once, and loses the steps since the last checkpoint"
     command = shlex.join(["python", "-m", "l2dgs_jax.train", options.scene, "--output", str(folder), "--resume"])
     try:
-        with stop_requests(lambda: display("stopping", message=notice)) as stopping:
+        with (
+            stop_requests(lambda: display("stopping", message=notice)) as stopping,
+            _watching(dataset, options, config, display) as watch,
+        ):
             previews = options.report or options.tensorboard
             return fit_in_folder(
-                folder, dataset, config, start, display, stopping, options.devices, with_previews=previews
+                folder, dataset, config, start, display, stopping, options.devices, with_previews=previews, watch=watch
             )
     except Interrupted as stop:
         raise Interrupted(f"{stop}; go on with: {command}", stop.code) from None
@@ -160,6 +173,20 @@ def _fit(dataset: Dataset, options: Train, config: Config, start: Checkpoint, di
         if error.code != DISK_FULL:
             raise
         raise UserError(f"{error}, then go on with: {command}", DISK_FULL) from None
+
+
+@contextlib.contextmanager
+def _watching(
+    dataset: Dataset, options: Train, config: Config, display: Display
+) -> Iterator[Callable[[Progress], None] | None]:
+    """The viewer, if it is asked for."""
+    if not options.view:
+        yield None
+        return
+    host = options.view_host
+    told = lambda port: display("viewer", message=f"fly through it in a browser: http://{host}:{port}")
+    with live(dataset, config, host, options.view_port, told) as watch:
+        yield watch
 
 
 @contextlib.contextmanager

@@ -10,10 +10,10 @@ from typing import Annotated, Literal
 
 import tyro
 
-from l2dgs_jax.errors import UserError
 from l2dgs_jax.runs import open_run
 from l2dgs_jax.runtime import command_line
 from l2dgs_jax.viewer import serve
+from l2dgs_jax.viewer.server import check
 
 
 @dataclass(frozen=True)
@@ -36,13 +36,13 @@ class View:
 def main(arguments: Sequence[str]) -> None:
     """Serve as the command line says."""
     options = command_line.parse(View, arguments, "view")
-    if not 1 <= options.port <= 65535:
-        raise UserError(f"--port {options.port}: expected a number from 1 to 65535")
+    check(options.host, options.port)
     run = open_run(options.run, options.stage)
     print(f"preparing {options.run}", flush=True)
-    with serve(run, options.host, options.port) as port:
-        print(f"open http://{options.host}:{port} in a browser; Ctrl-C ends it")
-        print(f"from another machine: ssh -L {port}:{options.host}:{port} {socket.gethostname()}", flush=True)
+    with serve(run, options.host, options.port) as server:
+        print(f"open http://{options.host}:{server.port} in a browser; Ctrl-C ends it")
+        tunnel = f"ssh -L {server.port}:{options.host}:{server.port} {socket.gethostname()}"
+        print(f"from another machine: {tunnel}", flush=True)
         until_interrupted()
 
 

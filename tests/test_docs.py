@@ -30,7 +30,7 @@ SHORT += ["--model.plane-channels=2", "--model.no-tracks", "--inbetweens=0", "--
 # Not run: what installs; what finds poses, trains studies or chooses kernels, as their own tests do; and what wants
 # several hosts, weights that are not here, or hours.
 INSTALLS = ("git ", "cd ", "pip ", "pytest", "pre-commit")
-LEFT_OUT = ("prepare", "sweep", "L2DGS_JAX_KERNELS", "XLA_FLAGS", "--weights", "experiments")
+LEFT_OUT = ("prepare", "sweep", "L2DGS_JAX_KERNELS", "XLA_FLAGS", "--weights", "--lpips", "experiments")
 
 
 def blocks(page, language):

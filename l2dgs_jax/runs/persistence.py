@@ -35,6 +35,7 @@ def fit_in_folder(
     stopping: Callable[[], int | None],
     device_count: int | None = None,
     with_previews: bool = False,
+    watch: Callable[[Progress], None] | None = None,
 ) -> Run:
     """`fit` with everything recorded that it takes to go on; a training that diverges goes back and on at lower rates.
 
@@ -47,6 +48,7 @@ def fit_in_folder(
         stopping: asked after every step for a signal that wants it to stop.
         device_count: see `fit`.
         with_previews: whether to leave pictures of two views, now and then.
+        watch: called after every step.
 
     Raises:
         Interrupted: a signal wanted it to stop; its last step is in a checkpoint.
@@ -54,7 +56,7 @@ def fit_in_folder(
     """
     while True:
         try:
-            return _fit(folder, dataset, config, start, display, stopping, device_count, with_previews)
+            return _fit(folder, dataset, config, start, display, stopping, device_count, with_previews, watch)
         except DivergedError as error:
             if start.halvings == HALVINGS or jax.process_count() > 1:
                 raise UserError(
@@ -77,6 +79,7 @@ def _fit(
     stopping: Callable[[], int | None],
     device_count: int | None,
     with_previews: bool,
+    watch: Callable[[Progress], None] | None,
 ) -> Run:
     done = int(start.state.step)
     record = Recorder(folder, config, done, start.halvings)
@@ -97,6 +100,8 @@ def _fit(
         if record.step in drawn_at:
             files = previews.draw(folder, dataset, config, devices.member(progress.states, 0))
             display("previews", step=record.step, files=[str(file.relative_to(folder)) for file in files])
+        if watch:
+            watch(progress)
         if record.step == config.coarse_steps < config.steps:
             display("compiling", stage="fine")
         signal_number = stopping()

@@ -21,7 +21,7 @@ PREVIEWS = "previews"
 VIEWS = {"held-out": "test", "training": "train"}  # of which split
 INPUT, LOWLIGHT, WELLLIT = "input", "lowlight", "welllit"
 MOST, APART = 8, 100  # moments of a run, and steps between them at least
-LONG = 1000  # steps of a coarse stage that are worth the compilation of its own program
+LONG = 1000  # steps of a coarse stage that are worth the compilation of a program of its own
 WIDTH, QUALITY = 320, 85  # pixels at most; of JPEG
 
 
@@ -41,12 +41,16 @@ class Preview(NamedTuple):
     path: Path
 
 
+def first(config: Config) -> int:
+    """The step after which views can be drawn by the program that draws those at the end."""
+    return 0 if config.coarse_steps >= LONG or not config.fine_steps else config.coarse_steps
+
+
 def moments(config: Config) -> frozenset[int]:
     """The steps after which views are drawn: by the program that draws the pictures at the end, compiled for both."""
     count = min(MOST, max(config.steps // APART, 1))
     evenly = (round(config.steps * part / count) for part in range(1, count + 1))
-    coarse_too = config.coarse_steps >= LONG or not config.fine_steps
-    return frozenset(step for step in evenly if coarse_too or step > config.coarse_steps)
+    return frozenset(step for step in evenly if step > first(config))
 
 
 def draw(folder: Path, dataset: Dataset, config: Config, state: TrainState) -> list[Path]:
@@ -64,7 +68,7 @@ def draw(folder: Path, dataset: Dataset, config: Config, state: TrainState) -> l
     Raises:
         UserError: a file cannot be written.
     """
-    run = Run(config, dataset, _with_last_capacity(state, config))
+    run = Run(config, dataset, with_last_capacity(state, config))
     files: list[Path] = []
     for view, split_name in VIEWS.items():
         split = getattr(dataset, split_name)
@@ -102,7 +106,7 @@ def _path(folder: Path, view: str, kind: str, step: int | None = None) -> Path:
     return folder / PREVIEWS / view / (f"{kind}.jpg" if step is None else f"{kind}-{step:06d}.jpg")
 
 
-def _with_last_capacity(state: TrainState, config: Config) -> TrainState:
+def with_last_capacity(state: TrainState, config: Config) -> TrainState:
     """With as many rows as at the end of the run, as far as that is known: every number of rows is a compilation."""
     cfg, rows = config.density, len(state.scene.alive)
     most = int(cfg.max_gaussians) if cfg.method == "mcmc" and cfg.start < cfg.stop else 0

@@ -1,5 +1,6 @@
 """A trained scene together with what it was trained on."""
 
+import dataclasses
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -36,6 +37,13 @@ class Run:
     def moving(self) -> bool:
         """Whether the state is past the coarse stage, in which nothing moves."""
         return int(self.state.step) > self.config.coarse_steps
+
+    def later(self, state: TrainState) -> "Run":
+        """The run at another state; if that has the same shapes, known sizes are not compiled again."""
+        run = dataclasses.replace(self, state=state)
+        for size, renderer in list(self._renderers.items()):  # another thread may be adding to them
+            run.renderer(*size).pair_capacity = renderer.pair_capacity
+        return run
 
     def render(self, camera: Camera, width: int | None = None, height: int | None = None) -> RenderOutput:
         """Render one camera at its instant: well-lit and low-light image, L, R, B1, B2, alpha and depth.

@@ -28,6 +28,7 @@ FRUSTUM = 0.08  # size, in units of the stage
 class View(NamedTuple):
     """What a picture depends on, besides its size and its light."""
 
+    step: int
     wxyz: tuple[float, ...]
     position: tuple[float, ...]
     field: float
@@ -95,14 +96,15 @@ class Guest:
 
     def _view(self) -> View:
         camera = self._client.camera
-        return View(tuple(camera.wxyz), tuple(camera.position), camera.fov, self._window(), self._panel.instant())
+        step, instant = int(self._renderers.run.state.step), self._panel.instant()
+        return View(step, tuple(camera.wxyz), tuple(camera.position), camera.fov, self._window(), instant)
 
     def _window(self) -> Size:
         camera = self._client.camera
         return max(camera.image_width, 1), max(camera.image_height, 1)
 
     def _rendered(self, view: View, size: Size) -> Shown:
-        wxyz, position, field, window, instant = view
+        _, wxyz, position, field, window, instant = view
         camera = self._stage.camera(np.array(wxyz), np.array(position), field, window, size, instant)
         return Shown(view, size, self._renderers.render(camera, size))
 

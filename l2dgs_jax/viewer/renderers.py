@@ -23,18 +23,20 @@ class Renderers:
     """Renders a run in those sizes whose programs are compiled, and compiles others in the background.
 
     Attributes:
+        run: what is rendered.
         seconds: what a picture of a size takes, for those that are compiled.
     """
 
-    def __init__(self, run: Run, told: Callable[[], None] = lambda: None):
+    def __init__(self, run: Run, told: Callable[[], None] = lambda: None, growing: bool = True):
         """Without any size yet.
 
         Args:
             run: what is rendered.
             told: called, from another thread, whenever a size has been compiled in the background.
+            growing: whether anything is compiled in the background.
         """
-        self.seconds: dict[Size, float] = {}
-        self._run, self._told = run, told
+        self.run, self.seconds = run, dict[Size, float]()
+        self._told, self._growing = told, growing
         self._pairs: dict[Size, float] = {}
         self._ordered: set[Size] = set()
         self._background = ThreadPoolExecutor(1, "compile")
@@ -44,13 +46,13 @@ class Renderers:
         if size in self.seconds:
             return
         nearest = min(self.seconds, key=lambda other: abs(math.log(math.prod(other) / math.prod(size))), default=None)
-        renderer = self._run.renderer(*size)
+        renderer = self.run.renderer(*size)
         if nearest:
             larger = math.prod(size) / math.prod(nearest)
             if larger * self.seconds[nearest] > STILL:
                 return
             renderer.pair_capacity = next_capacity(MARGIN * larger * self._pairs[nearest])
-        trained, frame = self._run.dataset.train.cameras, (self._run.dataset.width, self._run.dataset.height)
+        trained, frame = self.run.dataset.train.cameras, (self.run.dataset.width, self.run.dataset.height)
         for index in np.linspace(0, len(trained.time) - 1, TRIED).astype(int):
             camera = reframe(select_camera(trained, int(index)), frame, size)
             begun = time.perf_counter()
@@ -61,7 +63,7 @@ class Renderers:
 
     def order(self, sizes: Sequence[Size]) -> None:
         """Compile sizes in the background, in their order; those that were too slow are tried again."""
-        for size in sizes:
+        for size in sizes if self._growing else ():
             if size not in self.seconds and size not in self._ordered:
                 self._ordered.add(size)
                 self._background.submit(self._compile_and_tell, size)
@@ -81,7 +83,7 @@ class Renderers:
     def render(self, camera: Camera, size: Size) -> RenderOutput:
         """Render a camera as NumPy arrays."""
         begun = time.perf_counter()
-        output = jax.device_get(self._run.renderer(*size)(camera))
+        output = jax.device_get(self.run.renderer(*size)(camera))
         taken, usual = time.perf_counter() - begun, self.seconds[size]
         self.seconds[size] = 0.8 * usual + 0.2 * min(taken, 2 * usual)  # a new compilation is not the pace
         return output

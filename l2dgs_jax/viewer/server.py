@@ -4,9 +4,10 @@ import contextlib
 import io
 import socket
 import threading
+import time
 import traceback
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from l2dgs_jax.cameras.geometry import mean_up
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.runs.run import Run
 from l2dgs_jax.runtime.extras import extra
+from l2dgs_jax.training.step import TrainState
 from l2dgs_jax.viewer.guest import Guest
 from l2dgs_jax.viewer.ladder import ladder
 from l2dgs_jax.viewer.renderers import Renderers
@@ -25,32 +27,63 @@ from l2dgs_jax.visualize import films
 USUAL_WINDOW = 1280, 720  # pixels
 
 
+class Server(NamedTuple):
+    """What shows a run.
+
+    Attributes:
+        port: where it listens.
+        watched: whether any browser looks.
+        show: shows the same run at another state from now on.
+    """
+
+    port: int
+    watched: Callable[[], bool]
+    show: Callable[[TrainState], None]
+
+
+def check(host: str, port: int, prefix: str = "") -> None:
+    """Complain of what makes no address, or of what is missing.
+
+    Args:
+        host: address to listen at.
+        port: to listen at.
+        prefix: of the options that these come from.
+
+    Raises:
+        UserError: viser is not installed, the port is none, or there is no listening at that address.
+    """
+    extra("viser", "view", "viewing")
+    if not 1 <= port <= 65535:
+        raise UserError(f"--{prefix}port {port}: expected a number from 1 to 65535")
+    try:
+        socket.create_server((host, 0)).close()
+    except OSError as error:
+        what = "an address of this machine, or 0.0.0.0"
+        raise UserError(f"--{prefix}host {host}: {error.strerror}; expected {what}") from None
+
+
 @contextlib.contextmanager
-def serve(run: Run, host: str, port: int) -> Iterator[int]:
+def serve(run: Run, host: str, port: int, share: float = 1.0) -> Iterator[Server]:
     """Show a run to browsers while the block is entered.
 
     Every browser has its own camera, instant and light. One thread draws for all of them.
 
     Args:
         run: what to show.
-        host: address to listen at.
+        host: address to listen at, see `check`.
         port: to listen at, or the next that is free.
+        share: of the time that drawing may take. Below 1, pictures remain as small and coarse as those that move.
 
     Yields:
-        The port.
-
-    Raises:
-        UserError: viser is not installed, or there is no listening at that address.
+        The server.
     """
-    library = extra("viser", "view", "viewing")
-    _check_address(host)
-    turns, guests = Turns(), dict[int, Guest]()
+    turns, guests, over = Turns(), dict[int, Guest](), threading.Event()
 
     def sharper_possible() -> None:
         for number in list(guests):
             turns.rest(number)
 
-    renderers = Renderers(run, sharper_possible)
+    renderers = Renderers(run, sharper_possible, growing=share == 1)
     trained, frame = run.dataset.train.cameras, (run.dataset.width, run.dataset.height)
     smallest = ladder(USUAL_WINDOW)[0]
     renderers.compile(smallest)
@@ -58,7 +91,7 @@ def serve(run: Run, host: str, port: int) -> Iterator[int]:
     stage = Stage.of(trained, np.asarray(run.dataset.points), frame)
 
     with contextlib.redirect_stdout(io.StringIO()):  # it introduces itself
-        server = library.ViserServer(host, port, label="l2dgs", verbose=False)
+        server = extra("viser", "view", "viewing").ViserServer(host, port, label="l2dgs", verbose=False)
     server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
     server.scene.set_up_direction(mean_up(np.asarray(trained.viewmat)))
 
@@ -74,28 +107,29 @@ def serve(run: Run, host: str, port: int) -> Iterator[int]:
         guests.pop(client.client_id, None)
         turns.leave(client.client_id)
 
+    def show(state: TrainState) -> None:
+        renderers.run = renderers.run.later(state)
+        for number in list(guests):
+            turns.ask(number)
+
     def draw() -> None:
         while turn := turns.take():
-            guest = guests.get(turn.guest)
+            guest, begun = guests.get(turn.guest), time.monotonic()
             try:
                 if guest and guest.draw(turn.sharpen):
                     turns.rest(turn.guest)
             except Exception:  # a picture that fails is no reason to stop showing others
                 traceback.print_exc()
+            if share < 1:
+                over.wait((time.monotonic() - begun) * (1 / share - 1))
 
     thread = threading.Thread(target=draw, name="draw")
     thread.start()
     try:
-        yield server.get_port()
+        yield Server(server.get_port(), lambda: bool(guests), show)
     finally:
+        over.set()
         turns.close()
         renderers.close()
         server.stop()
         thread.join()
-
-
-def _check_address(host: str) -> None:
-    try:
-        socket.create_server((host, 0)).close()
-    except OSError as error:
-        raise UserError(f"--host {host}: {error.strerror}; expected an address of this machine, or 0.0.0.0") from None

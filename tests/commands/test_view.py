@@ -13,6 +13,7 @@ import pytest
 from browser import awaited, opened
 
 import l2dgs_jax
+from l2dgs_jax import train
 from l2dgs_jax.model.networks import init_bafe
 from l2dgs_jax.runtime import command_line
 from l2dgs_jax.view import main
@@ -37,6 +38,15 @@ def test_mistakes_are_one_sentence(tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
     error = complaint(capsys, folder)
     assert error == 'error: viser is not installed; expected the extra for viewing: pip install "l2dgs-jax[view]"\n'
+
+
+def test_mistakes_of_a_training_that_is_to_be_watched_leave_no_folder(tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("L2DGS_JAX_CACHE", "off")
+    for option, value in (("--view-port", "0"), ("--view-host", "192.0.2.1")):
+        with pytest.raises(SystemExit):
+            command_line.run(train.main, ["demo", "--output", str(tmp_path / "run"), "--view", option, value])
+        assert f"{option} {value}: " in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
 
 
 def lively_run(folder):
@@ -103,3 +113,28 @@ def test_a_browser_shows_what_its_controls_say(tmp_path):
         finally:
             server.send_signal(signal.SIGINT)
         assert server.wait(timeout=20) == 0
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("chromium") is None, reason="needs Chromium")
+def test_a_browser_sees_a_training_go_on(tmp_path):
+    finished_run.folder(tmp_path)
+    command = [sys.executable, "-m", "l2dgs_jax.train", str(tmp_path / "tiny_scene"), "--output", str(tmp_path / "run")]
+    small = ["--model.hidden=8", "--model.plane-size=4", "--model.plane-channels=2", "--model.no-tracks"]
+    steps = ["--coarse-steps=1", "--fine-steps=100000", "--no-report", "--view", "--view-port=8927"]
+    with subprocess.Popen([*command, *small, *steps], stderr=subprocess.PIPE, text=True) as training:
+        try:
+            address = next(line.split()[-1] for line in training.stderr if "http://127" in line)
+            with opened(address, tmp_path / "profile") as tab:
+                page = tab()
+                awaited(lambda: " ms" in page.text())
+                seen = [page.picture()[PICTURE]]
+                for _ in range(3):
+                    awaited(lambda: (page.picture()[PICTURE] != seen[-1]).any())
+                    seen.append(page.picture()[PICTURE])
+                assert not page.complaints()
+        finally:
+            training.send_signal(signal.SIGTERM)
+            rest = training.stderr.read()
+        assert training.wait(timeout=60) == 128 + signal.SIGTERM
+        assert "go on with: " in rest

@@ -140,7 +140,8 @@ def test_a_small_pair_buffer_grows_for_all(members, alone):
 )
 def test_every_setting_that_members_may_differ_in_can_be_traced(forms):
     """A step whose numbers are traced is the step whose numbers are compiled in."""
-    one = member(0, {"loss.amplification": 0.02, "loss.gate": 0.03, "optim.decay_steps": 7} | forms)
+    optional = {"loss.structure_illumination": 0.3, "loss.structure_beta_illumination": 0.2, "optim.decay_steps": 7}
+    one = member(0, optional | {"loss.amplification": 0.02, "loss.gate": 0.03} | forms)
     config, batch = one.config, load_batch(one.split, np.array([0, 3]))
     values = {
         name: jax.tree.map(jnp.asarray, value)

@@ -1,5 +1,6 @@
 """One browser: what it asks for and what it is shown."""
 
+from types import SimpleNamespace
 from typing import get_args
 
 import numpy as np
@@ -25,6 +26,7 @@ class Pretended(Renderers):
 
     def __init__(self, sizes):
         self.seconds, self.asked, self.ordered = dict.fromkeys(sizes, 0.02), [], []
+        self.run = SimpleNamespace(state=SimpleNamespace(step=7))
 
     def order(self, sizes):
         self.ordered = list(sizes)
@@ -91,6 +93,14 @@ def test_only_camera_window_and_instant_take_a_rendering(visit, renderers):
     visit.look()
     assert len(renderers.asked) == 3
     assert [float(camera.time) for camera, _ in renderers.asked[1:]] == [0.5, 0.5]
+
+
+def test_a_later_state_takes_a_rendering(visit, renderers):
+    visit.look()
+    visit.look()
+    renderers.run.state.step = 8
+    visit.look()
+    assert len(renderers.asked) == 2
 
 
 def test_each_output_is_another_picture(visit):
