@@ -1,6 +1,5 @@
 """`python -m l2dgs_jax.view RUN`: fly through a run in the browser."""
 
-import contextlib
 import socket
 import threading
 from collections.abc import Sequence
@@ -12,6 +11,7 @@ import tyro
 
 from l2dgs_jax.runs import open_run
 from l2dgs_jax.runtime import command_line
+from l2dgs_jax.runtime.signals import stop_requests
 from l2dgs_jax.viewer import serve
 from l2dgs_jax.viewer.server import check
 
@@ -43,13 +43,14 @@ def main(arguments: Sequence[str]) -> None:
         print(f"open http://{options.host}:{server.port} in a browser; Ctrl-C ends it")
         tunnel = f"ssh -L {server.port}:{options.host}:{server.port} {socket.gethostname()}"
         print(f"from another machine: {tunnel}", flush=True)
-        until_interrupted()
+        until_stopped()
 
 
-def until_interrupted() -> None:
-    """Wait for Ctrl-C."""
-    with contextlib.suppress(KeyboardInterrupt):
-        threading.Event().wait()
+def until_stopped() -> None:
+    """Wait for SIGINT, which is Ctrl-C, or SIGTERM."""
+    asked = threading.Event()
+    with stop_requests(asked.set):
+        asked.wait()
 
 
 if __name__ == "__main__":

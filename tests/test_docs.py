@@ -71,7 +71,7 @@ def test_what_a_page_tells_to_type_runs(page, tmp_path_factory, tmp_path, monkey
     monkeypatch.setattr(engine, "train_steps", counted)
     monkeypatch.setattr(train, "contact_sheet", lambda run: np.zeros((8, 8, 3), np.uint8))
     monkeypatch.setattr(train, "write_run_video", lambda run, stem, quiet: stem)
-    monkeypatch.setattr(view, "until_interrupted", lambda: None)
+    monkeypatch.setattr(view, "until_stopped", lambda: None)
     for _, _, module, *arguments in programs(page):
         training = module.endswith("train") and "--resume" not in arguments
         # Pages show several commands that fill the same folder.

@@ -111,7 +111,7 @@ def test_a_browser_shows_what_its_controls_say(tmp_path):
                 here = tuple(f"{scheme}{place}" for scheme in ("http://", "ws://", "blob:http://"))
                 assert all(url.startswith((*here, "data:")) for url in page.addresses() + other.addresses())
         finally:
-            server.send_signal(signal.SIGINT)
+            server.send_signal(signal.SIGTERM)
         assert server.wait(timeout=20) == 0
 
 
