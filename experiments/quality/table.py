@@ -1,7 +1,8 @@
 """`python -m experiments.quality.table STUDY...`: what studies found, in one table of means and spreads over seeds.
 
-Each argument is a folder that `python -m l2dgs_jax.sweep` has filled. A row is a combination of settings, a column a
-score on one scene: mean and, with several seeds, half the range over them. `--json FILE` keeps the table's numbers.
+Each argument is a folder that `python -m l2dgs_jax.sweep` has filled, or a file that `--json FILE` has kept the numbers
+of a table in. A row is a combination of settings, a column a score on one scene: mean and, with several seeds, half the
+range over them. Of a single combination there is one table, with a row for each scene.
 """
 
 import json
@@ -16,10 +17,12 @@ import numpy as np
 import tyro
 
 Row = tuple[tuple[str, str], ...]  # names and values of settings
+Found = dict[Row, dict[str, dict[str, list[float]]]]  # scores over the seeds, by settings, scene and name
 SCORES = {
     "low": ("lowlight", "psnr"),
     "moving": ("lowlight_regions", "dynamic", "psnr"),
     "still": ("lowlight_regions", "static", "psnr"),
+    "lit": ("welllit", "overall", "psnr"),
     "gain": ("welllit", "overall", "psnr_gain"),
     "SSIM": ("welllit", "overall", "ssim"),
 }
@@ -30,7 +33,7 @@ class Table:
     """Compare studies.
 
     Attributes:
-        studies: folders that `sweep` has filled.
+        studies: folders that `sweep` has filled, or files that `json` has named.
         json: file for the numbers.
     """
 
@@ -38,10 +41,14 @@ class Table:
     json: Path | None = None
 
 
-def collect(studies: Sequence[Path]) -> dict[Row, dict[str, dict[str, list[float]]]]:
-    """Scores over the seeds, by settings, scene and name."""
-    found: dict[Row, dict[str, dict[str, list[float]]]] = defaultdict(lambda: defaultdict(lambda: defaultdict(list)))
+def collect(studies: Sequence[Path]) -> Found:
+    """Scores of all studies together."""
+    found: Found = defaultdict(lambda: defaultdict(lambda: defaultdict(list)))
     for study in studies:
+        if study.is_file():
+            for kept in json.loads(study.read_text()):
+                found[tuple(kept["settings"].items())] |= kept["scenes"]
+            continue
         for member in json.loads((study / "results.json").read_text())["members"]:
             varied = {name: value for name, value in member["varied"].items() if name != "seed"}
             row = tuple((name, str(value)) for name, value in varied.items())
@@ -55,22 +62,26 @@ def collect(studies: Sequence[Path]) -> dict[Row, dict[str, dict[str, list[float
 def _score(scores: Any, path: Sequence[str]) -> float | None:
     for key in path:
         scores = scores.get(key) if isinstance(scores, dict) else None
-    return None if scores is None else float(scores)
+    return None if scores is None else round(float(scores), 4)
 
 
-def markdown(found: dict[Row, dict[str, dict[str, list[float]]]]) -> str:
-    """One table a scene: a row for each combination of settings."""
+def markdown(found: Found) -> str:
+    """One table a scene, with a row for each combination of settings; or the other way round if that is only one."""
     scenes = list(dict.fromkeys(scene for rows in found.values() for scene in rows))
-    parts = []
-    for scene in scenes:
-        shown = [name for name in SCORES if any(name in rows.get(scene, {}) for rows in found.values())]
-        lines = [[scene, "seeds", *shown], ["---"] * (len(shown) + 2)]
-        for row, rows in found.items():
-            if scene in rows:
-                seeds = max(map(len, rows[scene].values()))
-                lines.append([_label(row), str(seeds), *(_cell(name, rows[scene].get(name)) for name in shown)])
-        parts.append("".join(f"| {' | '.join(cells)} |\n" for cells in lines))
-    return "\n".join(parts)
+    if len(found) == 1:
+        ((row, rows),) = found.items()
+        return _table(_label(row), rows)
+    parts = ({_label(row): rows[scene] for row, rows in found.items() if scene in rows} for scene in scenes)
+    return "\n".join(map(_table, scenes, parts))
+
+
+def _table(corner: str, rows: dict[str, dict[str, list[float]]]) -> str:
+    shown = [name for name in SCORES if any(name in scores for scores in rows.values())]
+    lines = [[corner, "seeds", *shown], ["---"] * (len(shown) + 2)]
+    for label, scores in rows.items():
+        seeds = max(map(len, scores.values()))
+        lines.append([label, str(seeds), *(_cell(name, scores.get(name)) for name in shown)])
+    return "".join(f"| {' | '.join(cells)} |\n" for cells in lines)
 
 
 def _label(row: Row) -> str:
@@ -91,7 +102,7 @@ def main() -> None:
     found = collect(options.studies)
     if options.json is not None:
         rows = [{"settings": dict(row), "scenes": scenes} for row, scenes in found.items()]
-        options.json.write_text(json.dumps(rows, indent=1) + "\n")
+        options.json.write_text(json.dumps(rows) + "\n")
     sys.stdout.write(markdown(found))
 
 

@@ -7,10 +7,12 @@ from pathlib import Path
 
 import pytest
 
+from experiments.quality import table
 from l2dgs_jax.study import spec
 
 ROOT = Path(__file__).parents[2]
-STUDIES = sorted((ROOT / "experiments" / "quality" / "studies").glob("*.toml"))
+RECORD = ROOT / "experiments" / "quality"
+STUDIES, RESULTS = sorted(RECORD.glob("studies/*.toml")), sorted(RECORD.glob("results/*.json"))
 
 
 @pytest.mark.parametrize("path", STUDIES, ids=lambda path: path.stem)
@@ -43,3 +45,20 @@ def test_its_table_has_means_and_spreads_over_seeds(tmp_path):
     assert room[2:] == ["| inbetweens 0.0 | 1 | 30.00 |"]
     kept = json.loads((tmp_path / "table.json").read_text())
     assert kept[1]["scenes"]["toys"]["low"] == [35.0, 35.2]
+    assert table.markdown(table.collect([tmp_path / "table.json"])) == ran.stdout
+
+
+def test_a_single_combination_has_a_row_for_each_scene():
+    found = {(): {"toys": {"low": [36.0, 36.5], "SSIM": [0.9, 0.8]}, "room": {"low": [37.0]}}}
+    assert table.markdown(found).splitlines() == [
+        "| the preset | seeds | low | SSIM |",
+        "| --- | --- | --- | --- |",
+        "| toys | 2 | 36.25 ± 0.25 | 0.850 ± 0.050 |",
+        "| room | 1 | 37.00 |  |",
+    ]
+
+
+@pytest.mark.parametrize("path", RESULTS, ids=lambda path: path.stem)
+def test_the_documentation_shows_what_was_measured(path):
+    pages = [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]
+    assert any(table.markdown(table.collect([path])) in page.read_text() for page in pages)
