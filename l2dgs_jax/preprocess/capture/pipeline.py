@@ -21,7 +21,6 @@ from l2dgs_jax.runtime.files import expect_new, new_folder, replacing, write_jso
 
 FEWEST_FRAMES = 5
 FEWEST_REGISTERED = 0.5  # part of the frames
-LEAST_PARALLAX = 0.05  # part of the pairs of frames that must show some
 ADVICE = (
     "film more slowly, with more light and more overlap, and walk instead of turning on the spot; "
     "or try more --frames, or another --camera-model"
@@ -101,9 +100,9 @@ def prepare(source: Path, output: Path, cfg: CaptureConfig, curve: Curve = brigh
     structure.find_features(workplace, names, cfg.camera_model)
     structure.match_features(workplace, names)
     pairs, with_parallax = structure.count_pairs(workplace)
-    if with_parallax < LEAST_PARALLAX * pairs:
+    if pairs and not with_parallax:  # a scene of little depth has few, and its poses are found all the same
         raise UserError(
-            f"{source}: {with_parallax} of {pairs} pairs of frames show parallax, so the camera only turns or "
+            f"{source}: 0 of {pairs} pairs of frames show parallax, so the camera only turns or "
             f"sees a flat surface; expected a camera that moves through the scene: {ADVICE}"
         )
     model = structure.reconstruct(workplace, len(names))
