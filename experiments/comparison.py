@@ -16,13 +16,14 @@ import numpy as np
 import tyro
 from jaxtyping import UInt8
 
-from experiments.web_page import data_url, write_page
+from experiments.web_page import write_page
 from l2dgs_jax.cameras import select_camera
 from l2dgs_jax.data.images import encode_jpeg, to_bytes
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.runs import open_run
 from l2dgs_jax.runs.views import views
 from l2dgs_jax.runtime import command_line
+from l2dgs_jax.runtime.pages import data_url
 from l2dgs_jax.study import report
 
 QUALITY = 92  # of JPEG

@@ -18,11 +18,12 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import tyro
 
-from experiments.web_page import data_url, write_page
+from experiments.web_page import write_page
 from l2dgs_jax.data.parsing import read_json
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.runtime import command_line
 from l2dgs_jax.runtime.files import is_taken, write_json
+from l2dgs_jax.runtime.pages import data_url
 
 CRITERIA = (
     "Natural-looking brightness and lighting",

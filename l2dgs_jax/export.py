@@ -148,7 +148,7 @@ def _write_splats(run: Run, options: Export, path: Path) -> None:
 def _write_page(run: Run, options: Export, path: Path) -> None:
     """Bake key instants into one page."""
     split = run.dataset.train
-    frames = len(split.names) + len(run.dataset.test.names)
+    frames = len(np.union1d(split.cameras.time, run.dataset.test.cameras.time))
     count = options.times or min(max(frames, 2), MOST_INSTANTS)
     with replacing(path) as temporary:
         baked = bake(run, np.linspace(0, 1, count).tolist(), OVERBRIGHT, web_page.IMAGES)

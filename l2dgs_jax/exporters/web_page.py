@@ -4,7 +4,6 @@ import base64
 import html
 import zlib
 from importlib import resources
-from string import Template
 from typing import Any
 
 import numpy as np
@@ -21,7 +20,7 @@ from l2dgs_jax.exporters.tracks import Tracks
 from l2dgs_jax.kernels.tiles import MAX_ALPHA, MIN_ALPHA
 from l2dgs_jax.rasterizer.projection import EPS_2D, FIELD_MARGIN
 from l2dgs_jax.runs import Run
-from l2dgs_jax.runtime.pages import script_json
+from l2dgs_jax.runtime.pages import filled, script_json
 from l2dgs_jax.types import Camera
 
 IMAGES: tuple[Image, ...] = ("welllit", "lowlight")
@@ -77,7 +76,8 @@ def page(run: Run, tracks: Tracks, scores: Float[np.ndarray, "T I"], seconds: fl
     """
     source = resources.files("l2dgs_jax.exporters") / "player"
     read = lambda *names: "\n".join((source / name).read_text("utf-8").strip() for name in names)
-    return Template(read("page.html")).substitute(
+    return filled(
+        read("page.html"),
         title=html.escape(run.dataset.name),
         summary=SUMMARY,
         information=_information(tracks, scores),

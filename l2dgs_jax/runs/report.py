@@ -1,10 +1,8 @@
 """report.html: a page in the run folder that shows how its training goes, and reloads itself while it does."""
 
-import base64
 import contextlib
 import html
 import math
-import re
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,12 +13,12 @@ from l2dgs_jax.runs import previews
 from l2dgs_jax.runs.folder import CONTACT_SHEET, VIDEO, read_metrics
 from l2dgs_jax.runs.recorder import terms
 from l2dgs_jax.runtime.files import replacing
-from l2dgs_jax.runtime.pages import script_json
+from l2dgs_jax.runtime.pages import data_url, filled, script_json
 
 REPORT = "report.html"
 INTERVAL = 15  # seconds between two writings
 POINTS = 400  # of a curve, about
-TEMPLATE = Path(__file__).with_name(REPORT)  # with TITLE and DATA in the places of what is shown
+TEMPLATE = Path(__file__).with_name(REPORT)
 
 
 class Report:
@@ -59,7 +57,7 @@ class Report:
         elif event == "end":
             self.shown |= {"running": False, "state": facts.get("reason", "finished"), "left": None}
         if event not in ("step", "metrics") or time.monotonic() >= self.due:
-            with contextlib.suppress(UserError):
+            with contextlib.suppress(UserError, OSError):
                 self.write()
             self.due = time.monotonic() + INTERVAL
 
@@ -77,9 +75,9 @@ class Report:
             "curves": curves(self.lines),
             "views": _views(self.folder),
         }
-        parts = {"TITLE": html.escape(self.shown.get("scene", "")), "DATA": script_json(content)}
         with replacing(self.folder / REPORT) as temporary:
-            temporary.write_text(re.sub("|".join(parts), lambda found: parts[found[0]], TEMPLATE.read_text()))
+            title = html.escape(self.shown.get("scene", ""))
+            temporary.write_text(filled(TEMPLATE.read_text(), title=title, data=script_json(content)))
 
 
 def curves(lines: Sequence[dict[str, Any]]) -> dict[str, Any]:
@@ -112,7 +110,7 @@ def _views(folder: Path) -> list[dict[str, Any]]:
     """The previews by view: the frame, and the pictures of every step, as data URIs."""
     views: dict[str, dict[str, Any]] = {}
     for view, kind, step, path in previews.kept(folder):
-        encoded = f"data:image/jpeg;base64,{base64.b64encode(path.read_bytes()).decode()}"
+        encoded = data_url(path.read_bytes(), path.name)
         entry = views.setdefault(view, {"name": view, "frame": None, "steps": {}})
         if step is None:
             entry["frame"] = encoded

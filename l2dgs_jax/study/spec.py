@@ -146,7 +146,7 @@ def _grid(path: Path, table: Any) -> list[dict[str, Any]]:
 
 
 def _preset(path: Path, name: Any) -> str:
-    if name not in PRESETS:
+    if not isinstance(name, str) or name not in PRESETS:
         raise UserError(f"{path}: no preset is called {name!r}; expected one of {', '.join(PRESETS)}")
     return name
 

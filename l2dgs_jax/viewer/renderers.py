@@ -53,13 +53,14 @@ class Renderers:
                 return
             renderer.pair_capacity = next_capacity(MARGIN * larger * self._pairs[nearest])
         trained, frame = self.run.dataset.train.cameras, (self.run.dataset.width, self.run.dataset.height)
+        taken = []
         for index in np.linspace(0, len(trained.time) - 1, TRIED).astype(int):
             camera = reframe(select_camera(trained, int(index)), frame, size)
             begun = time.perf_counter()
             output = jax.device_get(renderer(camera))
-            taken = time.perf_counter() - begun  # the last one's count: it compiles nothing
+            taken.append(time.perf_counter() - begun)
             self._pairs[size] = max(float(output.pairs), self._pairs.get(size, 0.0))
-        self.seconds[size] = taken
+        self.seconds[size] = min(taken)  # some of them compiled
 
     def order(self, sizes: Sequence[Size]) -> None:
         """Compile sizes in the background, in their order; those that were too slow are tried again."""
@@ -74,7 +75,8 @@ class Renderers:
         except (MemoryError, jax.errors.JaxRuntimeError) as error:  # the smaller sizes remain
             print(f"warning: no pictures of {size[0]}x{size[1]} pixels: {error}", file=sys.stderr)
         self._ordered.discard(size)
-        self._told()
+        if size in self.seconds:
+            self._told()
 
     def compiled(self, sizes: Sequence[Size]) -> list[Size]:
         """Those of the sizes that can be rendered at once; if there are none, whichever can."""

@@ -1,10 +1,12 @@
 """The command that writes a run for other programs."""
 
+import dataclasses
 import json
 import subprocess
 import sys
 
 import finished_run
+import jax
 import numpy as np
 import pytest
 
@@ -12,6 +14,7 @@ from l2dgs_jax import export
 from l2dgs_jax.data import clouds
 from l2dgs_jax.exporters import web_page
 from l2dgs_jax.exporters.splats import Splats
+from l2dgs_jax.runs import open_run
 from l2dgs_jax.runtime import command_line
 
 SUFFIXES = {"ply": ".ply", "splat": ".splat", "gltf": ".glb", "cloud": ".ply"}
@@ -94,6 +97,15 @@ def test_a_page_covers_all_instants(run_folder, baked_times, tmp_path, capsys):
 def test_a_page_has_an_instant_for_every_frame_and_no_more_than_needed(run_folder, baked_times, tmp_path):
     run_command(run_folder, "--to", "html", "--output", tmp_path / "page.html")
     assert len(baked_times) == finished_run.FRAMES
+
+
+def test_frames_of_several_cameras_at_an_instant_are_one_of_a_page(run_folder, baked_times, tmp_path, monkeypatch):
+    run = open_run(run_folder)
+    test = dataclasses.replace(run.dataset.test, cameras=jax.tree.map(lambda x: x[[1, 4]], run.dataset.train.cameras))
+    both = dataclasses.replace(run, dataset=dataclasses.replace(run.dataset, test=test))
+    monkeypatch.setattr(export, "open_run", lambda *_: both)
+    run_command(run_folder, "--to", "html", "--output", tmp_path / "page.html")
+    assert len(baked_times) == len(run.dataset.train.names)
 
 
 def test_a_page_of_nothing_is_not_written(run_folder, baked_times, tmp_path, monkeypatch, capsys):

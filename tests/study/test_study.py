@@ -89,6 +89,7 @@ def test_scenes_alone_are_a_study(study):
         ('scenes = ["a"]\nseeds = [-1]', "seeds"),
         ('scenes = ["a"]\nsede = [1]', "sede"),
         ('scenes = ["a"]\npreset = "nice"', "nice"),
+        ('scenes = ["a"]\npreset = ["default"]', "no preset is called"),
         ('scenes = ["a"]\none_program = 1', "one_program"),
         ('scenes = ["a"]\nsettings = 3', "settings"),
         ('scenes = ["a"]\n[settings]\nloss.nonsense = 1', "loss.nonsense"),

@@ -27,7 +27,7 @@ class Player {
     canvas.addEventListener("webglcontextlost", (event) => event.preventDefault());
     canvas.addEventListener("webglcontextrestored", () => {
       this.renderer = createRenderer(canvas, scene);
-      this.renderer.arrange(this.sorted);
+      if (this.sorted) this.renderer.arrange(this.sorted);
       this.resize();
     });
     steer(
@@ -41,8 +41,8 @@ class Player {
     );
   }
 
-  // The lens of the camera that the view started from, with the size of the canvas: enlarged until the picture fills it, unless more
-  // would be cut off than is left.
+  // The lens of the camera that the view started from, enlarged until the picture fills the canvas, unless more would
+  // be cut off than is left.
   lens() {
     const { width, height, dilation } = this.scene;
     const size = [this.canvas.width, this.canvas.height];

@@ -49,7 +49,7 @@ function createRenderer(canvas, scene) {
     count = sorted.length;
   }
 
-  // `lens` has focal, principal, size and dilation in pixels of the canvas; `image` is the number of the colours.
+  // `lens` has focal, principal and dilation in pixels of the canvas; `image` is the number of the colours.
   function draw(view, lens, { key, part }, image) {
     const at = splats.uniforms;
     gl.viewport(0, 0, canvas.width, canvas.height);
