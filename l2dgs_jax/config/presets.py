@@ -48,6 +48,7 @@ def _presets() -> dict[str, Config]:
         inbetweens=0.3,
         model=ModelConfig(
             unit="depth",
+            scale_growth="linear",  # exponentially, a few Gaussians come to fill the picture
             motion_gate=True,
             tracks=True,
             hidden=64,

@@ -90,6 +90,8 @@ class ModelConfig:
     aggregation: Literal["paired_sum", "product"] = "paired_sum"  # Eq. 1, or the product of all six planes
     hidden: int = 128  # width of g, of the heads and of OCD-Net
     opacity_head: bool = False  # a fourth head moves the opacity's logit, as 4DGS can (arXiv 2310.08528)
+    # How a Gaussian's scales grow with what their head adds; "linear": by a factor of 1 + x instead of exp(x)
+    scale_growth: Literal["exponential", "linear"] = "exponential"
     motion_gate: bool = False  # a factor a Gaussian in (0, 1) on all that the motion field does to it
     # With gates: share of the Gaussians that the motion field acts on at once, those whose gates are open widest
     moving_share: float = 1.0

@@ -44,6 +44,7 @@ def model_arrays(run: Run) -> dict[str, Shaped[np.ndarray, "..."]]:
         "near_plane": NEAR_PLANE * unit,
         "moving": run.moving,
         "aggregation": cfg.aggregation,
+        "scale_growth": cfg.scale_growth,
         "time_range": cfg.time_range,
         "box_rim": cfg.box_rim,
         "illumination_offset": cfg.illumination_offset,

@@ -57,7 +57,7 @@ def deform(
         changes = _changes(scene, gaussians, cameras, cfg, chances)
         means += length_unit(scene.extent, cfg) * changes.motion.means
         quats += changes.motion.quats
-        log_scales += changes.motion.log_scales
+        log_scales += _growth(changes.motion.log_scales, cfg)
         if changes.motion.logit_opacities is not None:
             logit_opacities += changes.motion.logit_opacities
         if changes.light is not None:
@@ -105,6 +105,13 @@ def _changes(
         factor = jax.nn.sigmoid(chosen(gate))
         changes = jax.tree.map(lambda rows: factor.reshape(1, -1, *[1] * (rows.ndim - 2)) * rows, changes)
     return changes if subset is None else jax.tree.map(lambda rows: compaction.expand(rows, subset, 1), changes)
+
+
+def _growth(log_scales: Float[Array, "V N 3"], cfg: ModelConfig) -> Float[Array, "V N 3"]:
+    """What is added to the logarithms of the scales for what their head says."""
+    if cfg.scale_growth == "exponential":
+        return log_scales
+    return jnp.log1p(jnp.maximum(log_scales, 0)) + jnp.minimum(log_scales, 0)
 
 
 def acting(scene: Scene, cfg: ModelConfig, chances: Float[Array, " N"] | None = None) -> compaction.Subset | None:

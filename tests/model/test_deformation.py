@@ -182,6 +182,23 @@ def test_fine_stage_adds_the_heads_to_the_raw_parameters():
         np.testing.assert_array_equal(getattr(moved, name), getattr(still, name))
 
 
+def test_linear_growth_keeps_scales_from_exploding():
+    linear = dataclasses.replace(CFG, scale_growth="linear")
+    params, cameras = scene(), look()
+    scales, canonical = params.heads.scale, np.exp(np.asarray(params.gaussians.log_scales))[None]
+    for size in (1.0, 100.0):
+        last = scales[-1]._replace(weight=size * scales[-1].weight, bias=size * (scales[-1].bias - 0.7))
+        heads = params.heads._replace(scale=(*scales[:-1], last))
+        motion, _ = field_and_motion(params._replace(heads=heads), cameras.time, CFG)
+        x = np.asarray(motion.log_scales)
+        assert x.min() < 0 < x.max()
+        moved = moved_at(params._replace(heads=heads), cfg=linear, cameras=cameras, moving=True)
+        expected = canonical * np.where(x > 0, 1 + x, np.exp(np.minimum(x, 0)))
+        np.testing.assert_allclose(moved.scales, expected, rtol=1e-12)
+    scaled = lambda params: moved_at(params, cfg=linear, cameras=cameras, moving=True).scales
+    check_grads(scaled, (params,), 1, ["rev"], eps=1e-6)
+
+
 def test_without_its_head_the_opacity_does_not_depend_on_time():
     params = scene()
     params = params._replace(heads=params.heads._replace(opacity=None))
