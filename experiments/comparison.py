@@ -5,7 +5,6 @@ over time, a curtain between any two of them, and an enlarged part of all. STUDY
 of the scripts for the paper's tables, has filled.
 """
 
-import json
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,17 +15,20 @@ import numpy as np
 import tyro
 from jaxtyping import UInt8
 
+from experiments.members import FINISHED, Member, labels
 from experiments.web_page import write_page
-from l2dgs_jax.cameras import select_camera
 from l2dgs_jax.data.images import encode_jpeg, to_bytes
+from l2dgs_jax.data.parsing import read_json, value
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.runs import open_run
 from l2dgs_jax.runs.views import views
 from l2dgs_jax.runtime import command_line
 from l2dgs_jax.runtime.pages import data_url
 from l2dgs_jax.study import report
+from l2dgs_jax.types import Camera
 
 QUALITY = 92  # of JPEG
+INPUT, TRUTH = "input", "truth"  # what the page calls the pictures that no member made
 
 
 @dataclass(frozen=True)
@@ -36,7 +38,7 @@ class Options:
     Attributes:
         study: folder that `sweep` or a table's script has filled.
         output: the page, .html.
-        views: held-out views of each scene, spread over time.
+        views: how many held-out views of each scene, spread over time.
     """
 
     study: tyro.conf.Positional[Path]
@@ -46,36 +48,51 @@ class Options:
 
 def main(arguments: Sequence[str]) -> None:
     options = tyro.cli(Options, args=arguments)
-    try:
-        members = json.loads((options.study / report.JSON).read_text())["members"]
-    except OSError:
-        raise UserError(f"{options.study}: holds no {report.JSON}; expected a study that has ended") from None
-    scenes: dict[str, list[dict[str, Any]]] = {}
-    for member in members:
-        if member["varied"]["seed"] == members[0]["varied"]["seed"]:
-            scenes.setdefault(member["scene"], []).append(member)
+    if options.views < 1:
+        raise UserError(f"--views {options.views}: expected at least 1")
+    if options.output.is_dir() or not options.output.parent.is_dir():
+        raise UserError(f"{options.output}: cannot be written; expected a file in an existing folder")
+    scenes = _members(options.study)
     shown = [_scene(options.study, scene, runs, options.views) for scene, runs in scenes.items()]
     write_page(options.output, Path(__file__).with_suffix(".html"), shown)
     print(f"wrote {options.output}, {options.output.stat().st_size / 2**20:.1f} MiB")
 
 
-def _scene(study: Path, scene: str, members: Sequence[dict[str, Any]], count: int) -> dict[str, Any]:
+def _members(study: Path) -> dict[str, dict[str, Member]]:
+    """The members of the first seed, by scene and by what the page calls them."""
+    path, what = study / report.JSON, "the results of a study that has ended"
+    members = value(path, read_json(path, what), "members", list)
+    keys = {"name", "scene", "variant", "varied", "ended"}
+    if not members or not all(isinstance(member, dict) and keys <= member.keys() for member in members):
+        raise UserError(f"{path}: its members lack some of {', '.join(sorted(keys))}; expected {what}")
+    called = labels(members)
+    scenes: dict[str, dict[str, Member]] = {}
+    for member in members:
+        name = called[member["name"]]
+        if name in (INPUT, TRUTH):
+            raise UserError(f"{path}: a variant is called {name!r}, as other pictures are; expected another name there")
+        if member["varied"]["seed"] == members[0]["varied"]["seed"]:
+            name += "" if member["ended"] == FINISHED else f" ({member['ended']})"
+            scenes.setdefault(member["scene"], {})[name] = member
+    return scenes
+
+
+def _scene(study: Path, scene: str, members: dict[str, Member], count: int) -> dict[str, Any]:
     """Pictures of one scene by name, each a list over the same instants."""
     pictures: dict[str, list[str]] = {}
     split, chosen = None, np.zeros(0, int)
-    for member in members:
+    for name, member in members.items():
         run = open_run(study / member["name"])
         if split is None:
             split = run.dataset.test
             in_time = np.argsort(split.cameras.time, kind="stable")
             chosen = in_time[np.unique(np.linspace(0, len(in_time) - 1, count).round().astype(int))]
-            pictures["input"] = [_url(to_bytes(split.images[i])) for i in chosen]
-        cameras = select_camera(split.cameras, chosen)
-        name = member["variant"] or member["name"]
+            pictures[INPUT] = [_url(to_bytes(split.images[i])) for i in chosen]
+        cameras = Camera(*(x[chosen] for x in split.cameras))
         pictures[name] = [_url(to_bytes(output.images.welllit)) for output in views(run, cameras)]
     assert split is not None
     if split.welllit is not None:
-        pictures["truth"] = [_url(to_bytes(split.welllit[i])) for i in chosen]
+        pictures[TRUTH] = [_url(to_bytes(split.welllit[i])) for i in chosen]
     times = [float(time) for time in split.cameras.time[chosen]]
     size = split.images.shape[2:0:-1]
     return {"name": Path(scene).name, "size": size, "times": times, "pictures": pictures}

@@ -6,13 +6,11 @@ its scenes; OUT/table1.json the same numbers. PSNR after one global gain tells w
 
 import sys
 from collections.abc import Sequence
-from pathlib import Path
-from typing import Any
 
 import tyro
 
 from experiments.published import MEASURES, TABLE1, Cells
-from experiments.tables import Options, means, table, trained, write
+from experiments.tables import Options, collect, table, trained, welllit, write
 from l2dgs_jax.runtime import command_line
 
 AFTER_GAIN = "psnr_gain"
@@ -20,17 +18,9 @@ AFTER_GAIN = "psnr_gain"
 
 def main(arguments: Sequence[str]) -> None:
     options = tyro.cli(Options, args=arguments)
-    found = collect(trained(options, "table1.toml"))
-    write(options, "table1", {"scenes": found, "paper": TABLE1}, markdown(found))
-
-
-def collect(members: Sequence[dict[str, Any]]) -> dict[str, dict[str, Cells]]:
-    """Mean scores over the seeds, by scene and method."""
-    groups: dict[str, dict[str, list[Cells]]] = {}
-    for member in members:
-        scores = groups.setdefault(Path(member["scene"]).name, {}).setdefault(member["variant"], [])
-        scores.append(member["scores"].get("welllit", {}))
-    return {scene: {name: means(scores) for name, scores in methods.items()} for scene, methods in groups.items()}
+    members = trained(options, "table1.toml")
+    found = collect(members, welllit)
+    write(options, "table1", members, {"scenes": found, "paper": TABLE1}, markdown(found))
 
 
 def markdown(found: dict[str, dict[str, Cells]]) -> str:

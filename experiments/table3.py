@@ -6,28 +6,19 @@ table, OUT/table3.json the same numbers.
 
 import sys
 from collections.abc import Sequence
-from typing import Any
 
 import tyro
 
 from experiments.published import TABLE3, Cells
-from experiments.tables import Options, means, table, trained, write
+from experiments.tables import Options, collect, over_scenes, table, trained, welllit, write
 from l2dgs_jax.runtime import command_line
 
 
 def main(arguments: Sequence[str]) -> None:
     options = tyro.cli(Options, args=arguments)
-    found = collect(trained(options, "table3.toml"))
-    write(options, "table3", {"rows": found, "paper": TABLE3}, markdown(found))
-
-
-def collect(members: Sequence[dict[str, Any]]) -> dict[str, Cells]:
-    """Mean scores over scenes and seeds, by variant."""
-    names = dict.fromkeys(member["variant"] for member in members)
-    return {
-        name: means(member["scores"].get("welllit", {}) for member in members if member["variant"] == name)
-        for name in names
-    }
+    members = trained(options, "table3.toml")
+    found = over_scenes(collect(members, welllit))
+    write(options, "table3", members, {"rows": found, "paper": TABLE3}, markdown(found))
 
 
 def markdown(found: dict[str, Cells]) -> str:

@@ -3,7 +3,7 @@
 import dataclasses
 import json
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,8 +11,13 @@ from typing import Any
 import numpy as np
 import tyro
 
+from experiments.members import FINISHED, Member, labels, left_out
 from experiments.published import MEASURES, REGIONS, Cells
 from l2dgs_jax.config import overrides
+from l2dgs_jax.metrics import Convention, Lpips, Network
+from l2dgs_jax.runs import open_run
+from l2dgs_jax.runs.lpips_weights import load_lpips
+from l2dgs_jax.runs.scores import evaluate
 from l2dgs_jax.runtime import devices
 from l2dgs_jax.runtime.files import replacing, write_json
 from l2dgs_jax.study import report, running
@@ -20,6 +25,7 @@ from l2dgs_jax.study.spec import Spec, read
 
 STUDIES = Path(__file__).parent / "studies"
 TITLES = {"psnr": "PSNR", "ssim": "SSIM", "lpips_alex": "LPIPS", "psnr_gain": "PSNR after gain"}
+CONVENTION: Convention = "paper"  # of regions, with LPIPS; PSNR and SSIM are the same by the usual one
 # Steps and sizes of a smoke run; the number of steps is that of each stage that a member has.
 QUICK_STEPS = 3
 QUICK = {"model.plane_size": 8, "model.hidden": 8, "model.tracks": False, "inbetweens": 0.0, "density.stop": 0}
@@ -33,27 +39,47 @@ class Options:
         output: folder for the study and the table; the same command goes on where it was interrupted.
         study: TOML file to run in place of the one in experiments/studies; the names of its variants are the rows.
         scenes: folders of scenes in place of the study's.
+        lpips_alex: files with the weights of LPIPS, as for `evaluate`; without them its columns stay empty.
         quick: a few steps on the first scene, to see that all of it works; its scores mean nothing.
     """
 
     output: tyro.conf.Positional[Path]
     study: Path | None = None
     scenes: tuple[str, ...] = ()
+    lpips_alex: tuple[Path, ...] = ()
     quick: bool = False
 
 
-def trained(options: Options, study: str) -> list[dict[str, Any]]:
+def trained(options: Options, study: str) -> list[Member]:
     """The results of all members of a study, as `results.json` holds them.
 
     Raises:
-        UserError: as `run_study`.
+        UserError: as `run_study`, or weights of LPIPS cannot be read.
     """
     devices.one_per_core()
+    lpips: dict[Network, Lpips] = {"alex": load_lpips("alex", options.lpips_alex)} if options.lpips_alex else {}
     scenes = [scene if scene == "demo" else str(Path(scene).absolute()) for scene in options.scenes]
     spec = read(options.study or STUDIES / study, scenes)
     spec = _quick(spec) if options.quick else spec
     running.run_study(spec, options.output, resume=(options.output / running.PLANS).exists())
-    return json.loads((options.output / report.JSON).read_text())["members"]
+    if lpips:
+        _score_again(options.output, lpips)
+    return _members(options.output)
+
+
+def _members(study: Path) -> list[Member]:
+    return json.loads((study / report.JSON).read_text())["members"]
+
+
+def _score_again(study: Path, lpips: dict[Network, Lpips]) -> None:
+    """Score what is finished with LPIPS too, unless that was done before."""
+    members = _members(study)
+    for member in members:
+        if member["ended"] == FINISHED and member["scores"]["region_convention"] != CONVENTION:
+            scores = evaluate(open_run(study / member["name"]), lpips=lpips, convention=CONVENTION)
+            path = study / member["name"] / report.RESULT
+            write_json(path, json.loads(path.read_text()) | {"scores": scores})
+    report.write(study, [member["name"] for member in members])
 
 
 def _quick(spec: Spec) -> Spec:
@@ -66,6 +92,33 @@ def _quick(spec: Spec) -> Spec:
             }
             plans.append(dataclasses.replace(plan, config=overrides.replace(plan.config, QUICK | steps)))
     return Spec(tuple(plans), spec.one_program)
+
+
+def collect(members: Sequence[Member], cells: Callable[[dict[str, Any]], Cells]) -> dict[str, dict[str, Cells]]:
+    """Mean scores over the seeds that did not diverge, by scene and label.
+
+    Args:
+        members: of a study.
+        cells: takes them from all scores of a member.
+    """
+    names = labels(members)
+    groups: dict[str, dict[str, list[Cells]]] = {}
+    for member in members:
+        group = groups.setdefault(Path(member["scene"]).name, {}).setdefault(names[member["name"]], [])
+        if member["ended"] == FINISHED:
+            group.append(cells(member["scores"]))
+    return {scene: {label: means(scores) for label, scores in rows.items()} for scene, rows in groups.items()}
+
+
+def over_scenes(found: dict[str, dict[str, Cells]]) -> dict[str, Cells]:
+    """Means over the scenes, by label."""
+    rows = dict.fromkeys(label for scores in found.values() for label in scores)
+    return {label: means(scores[label] for scores in found.values() if label in scores) for label in rows}
+
+
+def welllit(scores: dict[str, Any]) -> Cells:
+    """Those of the well-lit views, by region; none where no truth is known."""
+    return scores.get("welllit", {})
 
 
 def means(scores: Iterable[Cells]) -> Cells:
@@ -105,11 +158,18 @@ def _text(value: float | None, measure: str) -> str:
     return "–" if value is None else f"{value:.{1 if 'psnr' in measure else 2}f}"
 
 
-def write(options: Options, name: str, content: Any, markdown: str) -> None:
-    """Leave a table's numbers in NAME.json and itself in NAME.md, and print it."""
+def write(options: Options, name: str, members: Sequence[Member], content: Any, markdown: str) -> None:
+    """Leave a table's numbers in NAME.json and itself, with what must be known of it, in NAME.md, and print it."""
+    conventions = {member["scores"]["region_convention"] for member in members if member["ended"] == FINISHED}
+    if conventions:
+        shown = " or ".join(sorted(conventions))
+        markdown += f"\nOur regions are scored by the convention {shown}, see docs/metrics.md.\n"
+    missing = left_out(members)
+    if missing:
+        markdown += f"\nLeft out of all means: {', '.join(missing)}.\n"
     if options.quick:
         markdown = f"A smoke run of {QUICK_STEPS} steps a stage: its scores mean nothing.\n\n{markdown}"
-    write_json(options.output / f"{name}.json", {"quick": options.quick} | content)
+    write_json(options.output / f"{name}.json", {"quick": options.quick, "left_out": missing} | content)
     with replacing(options.output / f"{name}.md") as temporary:
         temporary.write_text(markdown)
     print(markdown)

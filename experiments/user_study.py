@@ -18,11 +18,12 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import tyro
 
+from experiments.published import TABLE2
 from experiments.web_page import write_page
-from l2dgs_jax.data.parsing import read_json
+from l2dgs_jax.data.parsing import read_json, value
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.runtime import command_line
-from l2dgs_jax.runtime.files import is_taken, write_json
+from l2dgs_jax.runtime.files import is_taken, replacing, write_json
 from l2dgs_jax.runtime.pages import data_url
 
 CRITERIA = (
@@ -80,10 +81,12 @@ def main(arguments: Sequence[str]) -> None:
         make_page(options)
         return
     key = read_json(options.key, "a key that `page` wrote")
+    for entry, kind in {"study": str, "methods": list, "key": dict}.items():
+        value(options.key, key, entry, kind)
     result = aggregate(key, {path: read_json(path, "answers that the page left") for path in options.answers})
     print(markdown(result))
     if options.json is not None:
-        write_json(options.json, result)
+        write_json(options.json, result | {"paper": TABLE2})
 
 
 def make_page(options: Page) -> None:
@@ -106,8 +109,9 @@ def make_page(options: Page) -> None:
         scenes.append({"name": name, "media": {k: data_url(path.read_bytes(), path.name) for k, path in shown.items()}})
     study = f"{options.output.stem}-{hashlib.sha256(json.dumps(key).encode()).hexdigest()[:8]}"
     data = {"study": study, "kind": options.kind, "criteria": CRITERIA, "letters": letters, "scenes": scenes}
-    write_page(options.output, Path(__file__).with_suffix(".html"), data)
-    write_json(key_file, {"study": study, "methods": methods, "key": key})
+    with replacing(options.output) as temporary:  # neither is left without the other
+        write_page(temporary, Path(__file__).with_suffix(".html"), data)
+        write_json(key_file, {"study": study, "methods": methods, "key": key})
     print(
         f"wrote {options.output}, {len(scenes)} scenes of {len(methods)} methods, and {key_file}: keep that from judges"
     )
@@ -198,11 +202,13 @@ def _with_interval(methods: Sequence[str], sums: np.ndarray, counts: np.ndarray,
 
 
 def markdown(result: dict[str, Any]) -> str:
-    """Table 2: a row for each method, a column for each criterion."""
+    """Table 2: a row for each method, a column for each criterion, and the paper's own rows."""
     lines = [["", *(f"Criterion ({numeral})" for numeral in NUMERALS)], ["---"] * (1 + len(CRITERIA))]
     for method, shares in result["chosen"].items():
         cells = zip(shares, result["rating"][method], strict=True)
         lines.append([method, *(f"{_text(share, 1)} / {_text(rating, 2)}" for share, rating in cells)])
+    for method, pairs in TABLE2.items():
+        lines.append([f"paper: {method}", *(f"{share:.1f} / {rating:.2f}" for share, rating in pairs)])
     table = "".join(f"| {' | '.join(line)} |\n" for line in lines)
     return f"{table}\n{result['participants']} participants; in brackets {result['interval']}.\n"
 

@@ -2,7 +2,8 @@
 
 Each argument is a folder that `python -m l2dgs_jax.sweep` has filled, or a file that `--json FILE` has kept the numbers
 of a table in. A row is a combination of settings, a column a score on one scene: mean and, with several seeds, half the
-range over them. Of a single combination there is one table, with a row for each scene.
+range over them. What diverged is named and left out. Of a single combination there is one table, with a row for each
+scene.
 """
 
 import json
@@ -15,6 +16,8 @@ from typing import Any
 
 import numpy as np
 import tyro
+
+from experiments.members import FINISHED, left_out
 
 Row = tuple[tuple[str, str], ...]  # names and values of settings
 Found = dict[Row, dict[str, dict[str, list[float]]]]  # scores over the seeds, by settings, scene and name
@@ -42,20 +45,24 @@ class Table:
 
 
 def collect(studies: Sequence[Path]) -> Found:
-    """Scores of all studies together."""
+    """Scores of all studies together; what diverged is named on standard error, and its seed not counted."""
     found: Found = defaultdict(lambda: defaultdict(lambda: defaultdict(list)))
     for study in studies:
         if study.is_file():
             for kept in json.loads(study.read_text()):
                 found[tuple(kept["settings"].items())] |= kept["scenes"]
             continue
-        for member in json.loads((study / "results.json").read_text())["members"]:
+        members = json.loads((study / "results.json").read_text())["members"]
+        for missing in left_out(members):
+            print(f"{study}: {missing} is left out", file=sys.stderr)
+        for member in members:
             varied = {name: value for name, value in member["varied"].items() if name != "seed"}
             row = tuple((name, str(value)) for name, value in varied.items())
-            for name, path in SCORES.items():
+            scores = found[row][Path(member["scene"]).name]
+            for name, path in SCORES.items() if member["ended"] == FINISHED else ():
                 score = _score(member["scores"], path)
                 if score is not None:
-                    found[row][Path(member["scene"]).name][name].append(score)
+                    scores[name].append(score)
     return found
 
 
@@ -79,7 +86,7 @@ def _table(corner: str, rows: dict[str, dict[str, list[float]]]) -> str:
     shown = [name for name in SCORES if any(name in scores for scores in rows.values())]
     lines = [[corner, "seeds", *shown], ["---"] * (len(shown) + 2)]
     for label, scores in rows.items():
-        seeds = max(map(len, scores.values()))
+        seeds = max(map(len, scores.values()), default=0)
         lines.append([label, str(seeds), *(_cell(name, scores.get(name)) for name in shown)])
     return "".join(f"| {' | '.join(cells)} |\n" for cells in lines)
 

@@ -1,7 +1,10 @@
 """The page of methods side by side, in a browser."""
 
+import json
+import re
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import browser
 import numpy as np
@@ -10,8 +13,87 @@ import pytest
 from experiments import comparison
 from experiments.comparison import _url
 from experiments.web_page import write_page
+from l2dgs_jax.errors import UserError
+from l2dgs_jax.study import report
+from l2dgs_jax.types import Camera
 
 TEMPLATE = Path(comparison.__file__).with_suffix(".html")
+
+
+def member(name, variant="a", seed=0, level=1.0, ended="finished"):
+    varied = {"seed": seed, "loss.exposure_level": level}
+    return {"name": name, "scene": "/data/mochi", "variant": variant, "varied": varied, "ended": ended}
+
+
+@pytest.fixture
+def study(tmp_path):
+    def write(*members):
+        (tmp_path / report.JSON).write_text(json.dumps({"members": members}))
+        return tmp_path
+
+    return write
+
+
+def test_every_member_of_the_first_seed_has_pictures_of_its_own(study, monkeypatch):
+    flat = lambda grey: np.full((3, 6, 8, 3), grey, np.float32)
+    cameras = Camera(np.zeros((3, 4, 4)), np.zeros((3, 3, 3)), np.array([0.5, 0.0, 1.0]))
+    split = SimpleNamespace(cameras=cameras, images=flat(0.1), welllit=flat(0.9))
+
+    def views(run, cameras):
+        for picture in flat(run.grey)[: len(cameras.time)]:
+            yield SimpleNamespace(images=SimpleNamespace(welllit=picture))
+
+    monkeypatch.setattr(comparison, "views", views)
+    opened = lambda path: SimpleNamespace(grey=0.2 + 0.1 * int(path.name), dataset=SimpleNamespace(test=split))
+    monkeypatch.setattr(comparison, "open_run", opened)
+    members = [
+        member("00"),
+        member("01", level=2.0),
+        member("02", variant="b"),
+        member("03", variant="c", ended="diverged at step 7"),
+        member("04", seed=1),
+    ]
+    folder = study(*members)
+    comparison.main([str(folder), str(folder / "page.html"), "--views", "2"])
+    data = re.search(r'<script type="application/json" id="data">(.*?)</script>', (folder / "page.html").read_text())
+    (scene,) = json.loads(data[1])
+    ours = ["a, loss.exposure_level 1.0", "a, loss.exposure_level 2.0", "b", "c (diverged at step 7)"]
+    assert list(scene["pictures"]) == ["input", *ours, "truth"]
+    assert len({tuple(pictures) for pictures in scene["pictures"].values()}) == len(scene["pictures"])
+    assert (scene["times"], scene["size"]) == ([0.0, 1.0], [8, 6])
+
+
+@pytest.mark.parametrize("name", ["input", "truth"])
+def test_names_of_other_pictures_are_refused(study, name):
+    folder = study(member("00", variant=name))
+    with pytest.raises(UserError, match=rf"results\.json: a variant is called '{name}'"):
+        comparison.main([str(folder), str(folder / "page.html")])
+
+
+@pytest.mark.parametrize(
+    ("results", "arguments", "naming"),
+    [
+        (None, [], r"results\.json: no such file"),
+        ('{"members": [', [], r"results\.json: cannot be read as JSON"),
+        ("{}", [], r"results\.json: 'members' is missing"),
+        ('{"members": []}', [], r"results\.json: its members"),
+        ('{"members": [{"name": "00"}]}', [], r"results\.json: its members"),
+        (None, ["--views", "0"], "--views 0"),
+        (None, ["--views", "-1"], "--views -1"),
+    ],
+)
+def test_mistakes_are_one_sentence(tmp_path, results, arguments, naming):
+    if results is not None:
+        (tmp_path / report.JSON).write_text(results)
+    with pytest.raises(UserError, match=naming):
+        comparison.main([str(tmp_path), str(tmp_path / "page.html"), *arguments])
+
+
+@pytest.mark.parametrize("output", ["no/page.html", ""])
+def test_a_place_that_cannot_be_written_is_found_before_anything_is_rendered(study, output):
+    folder = study(member("missing"))
+    with pytest.raises(UserError, match="expected a file in an existing folder"):
+        comparison.main([str(folder), str(folder / output)])
 
 
 @pytest.mark.slow

@@ -2,16 +2,24 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
+import finished_run
+import networks
+import numpy as np
 import pytest
 from scenes import write_nerfies
 
 from experiments import lowlight, published, table1, table3, tables
+from experiments.members import labels
+from l2dgs_jax import metrics
 from l2dgs_jax.config import PRESETS, overrides
-from l2dgs_jax.study import spec
+from l2dgs_jax.errors import UserError
+from l2dgs_jax.metrics.lpips import SMALLEST
+from l2dgs_jax.study import report, running, spec
 
 ROOT = Path(__file__).parents[2]
 BASE = PRESETS["paper"]
@@ -48,7 +56,7 @@ def test_every_row_of_table_3_differs_from_the_whole_by_what_it_says():
 
 @pytest.mark.parametrize("rows", [*published.TABLE1.values(), published.TABLE3])
 def test_regions_of_the_papers_figures_lie_on_both_sides_of_the_whole(rows):
-    """All but few: a figure in the wrong column would not."""
+    """By SSIM: of rows with a figure in the wrong column, few would."""
     sides = []
     for cells in rows.values():
         dynamic, static, overall = (cells[region]["ssim"] for region in published.REGIONS)
@@ -56,10 +64,13 @@ def test_regions_of_the_papers_figures_lie_on_both_sides_of_the_whole(rows):
     assert all(sides)
 
 
-def member(scene, variant, seed, psnr):
+def member(scene, variant, seed, psnr, ended="finished", **varied):
     regions = {region: {"psnr": psnr + k, "ssim": 0.5} for k, region in enumerate(published.REGIONS)}
-    scores = {"welllit": regions, "lowlight": regions["overall"], "lowlight_regions": regions | {"covisible": {}}}
-    return {"scene": f"/data/{scene}", "variant": variant, "varied": {"seed": seed}, "scores": scores}
+    lowlight = {"lowlight": regions["overall"], "lowlight_regions": regions | {"covisible": {}}}
+    scores = {"region_convention": "nsff", "gaussians": 7, "welllit": regions, **lowlight}
+    name = "-".join(map(str, (scene, variant, seed, *varied.values())))
+    found = {"name": name, "scene": f"/data/{scene}", "variant": variant, "varied": {"seed": seed, **varied}}
+    return found | {"ended": ended, "scores": scores}
 
 
 MEMBERS = [
@@ -76,7 +87,7 @@ def rows_of(text):
 
 
 def test_table_1_has_each_scene_beside_the_papers():
-    mochi, mine = table1.markdown(table1.collect(MEMBERS)).split("## ")[1:]
+    mochi, mine = table1.markdown(tables.collect(MEMBERS, tables.welllit)).split("## ")[1:]
     rows = rows_of(mochi.partition("\n\n")[2])
     assert rows["L2DGS"] == ["1.0", "0.50", "–", "2.0", "0.50", "–", "3.0", "0.50", "–"]
     assert rows["paper: L2DGS"] == ["21.0", "0.78", "0.07", "16.1", "0.77", "0.09", "17.6", "0.77", "0.16"]
@@ -85,14 +96,72 @@ def test_table_1_has_each_scene_beside_the_papers():
 
 
 def test_table_3_is_a_mean_over_scenes():
-    rows = rows_of(table3.markdown(table3.collect(MEMBERS)))
+    rows = rows_of(table3.markdown(tables.over_scenes(tables.collect(MEMBERS, tables.welllit))))
     assert rows["without_ssim"][:3] == ["7.0 (14.1)", "0.50 (0.41)", "– (0.20)"]
 
 
 def test_low_light_ends_in_a_mean():
-    rows = rows_of(lowlight.markdown(lowlight.collect([m for m in MEMBERS if m["variant"] == "L2DGS"])))
-    assert rows["mochi"] == ["1.0", "0.50", "2.0", "0.50", "3.0", "0.50"]
-    assert rows["mean"][-2:] == ["8.0 (31.9)", "0.50 (0.94)"]
+    rows = rows_of(lowlight.markdown(tables.collect(MEMBERS, lowlight.lowlight)))
+    assert rows["mochi: L2DGS"] == ["1.0", "0.50", "2.0", "0.50", "3.0", "0.50"]
+    assert (rows["mean: L2DGS"][-2:], rows["mean: without_ssim"][-2:]) == (["8.0", "0.50"], ["9.0", "0.50"])
+    assert rows["paper: L2DGS"][-2:] == ["31.9", "0.94"]
+
+
+def test_what_learns_from_brightened_frames_has_no_low_light_scores():
+    brightened = member("mochi", "gamma", 0, 5.0) | {"scores": {"region_convention": "nsff"}}
+    rows = rows_of(lowlight.markdown(tables.collect([*MEMBERS, brightened], lowlight.lowlight)))
+    assert rows["mochi: gamma"] == rows["mean: gamma"] == ["–"] * 6
+
+
+def test_points_of_a_grid_are_rows_of_their_own():
+    grid = [member("mochi", "a", seed, level, level=level) for seed in (0, 1) for level in (1.0, 2.0)]
+    plain = member("mochi", "b", 0, 3.0, level=3.0)
+    rows = tables.collect([*grid, plain], tables.welllit)["mochi"]
+    assert {name: cells["dynamic"]["psnr"] for name, cells in rows.items()} == {
+        "a, level 1.0": 1.0,
+        "a, level 2.0": 2.0,
+        "b": 3.0,
+    }
+    nameless = [one | {"variant": ""} for one in grid]
+    assert set(labels(nameless).values()) == {"level 1.0", "level 2.0"}
+    assert set(labels(nameless[:1]).values()) == {"the preset"}
+
+
+def test_what_diverged_is_in_no_mean_and_is_named(tmp_path, capsys):
+    diverged = [member("mochi", name, 1, 99.0, ended="diverged at step 7") for name in ("L2DGS", "without_exposure")]
+    found = tables.collect([*MEMBERS, *diverged], tables.welllit)["mochi"]
+    assert found["L2DGS"]["dynamic"]["psnr"] == 1.0
+    assert rows_of(tables.table([(name, [cells]) for name, cells in found.items()]))["without_exposure"] == ["–"] * 6
+    tables.write(tables.Options(tmp_path), "t", [*MEMBERS, *diverged], {}, "the table\n")
+    *_, convention, _, named = (tmp_path / "t.md").read_text().splitlines()
+    assert "nsff" in convention
+    assert named.endswith(": mochi-L2DGS-1 (diverged at step 7), mochi-without_exposure-1 (diverged at step 7).")
+    assert len(json.loads((tmp_path / "t.json").read_text())["left_out"]) == 2
+
+
+@pytest.mark.slow
+def test_weights_of_lpips_fill_its_columns_of_what_was_scored_without(tmp_path, tmp_path_factory, monkeypatch):
+    monkeypatch.setitem(metrics.NETWORKS, "alex", networks.TINY)
+    monkeypatch.setitem(SMALLEST, "alex", 1)
+    np.savez(tmp_path / "tiny.npz", **networks.state_dict("alex"))
+    out = tmp_path / "out"
+    members = [member("mochi", "a", 0, 5.0), member("mochi", "a", 1, 5.0, ended="diverged at step 7")]
+    for one in members:
+        shutil.copytree(finished_run.folder(tmp_path_factory.getbasetemp()), out / one["name"])
+        (out / one["name"] / report.RESULT).write_text(json.dumps(one))
+    names = [one["name"] for one in members]
+    monkeypatch.setattr(running, "run_study", lambda *_, **__: report.write(out, names))
+    study = tmp_path / "study.toml"
+    study.write_text('scenes = ["mochi"]')
+    options = tables.Options(out, study, lpips_alex=(tmp_path / "tiny.npz",))
+    first, second = tables.trained(options, "table1.toml")
+    assert first["scores"]["region_convention"] == "paper"
+    assert first["scores"]["welllit"]["overall"]["lpips_alex"] > 0
+    assert second == members[1], "what diverged is in no table"
+    monkeypatch.setattr(tables, "evaluate", None)
+    assert tables.trained(options, "table1.toml") == [first, second], "nothing is scored again"
+    with pytest.raises(UserError, match="missing"):
+        tables.trained(tables.Options(out, study, lpips_alex=(tmp_path / "missing.npz",)), "table1.toml")
 
 
 @pytest.mark.slow

@@ -22,9 +22,10 @@ def test_its_studies_can_be_read(path):
     assert all(plan.config.downscale == 2 for plan in plans)
 
 
-def member(scene, seed, inbetweens, psnr):
+def member(scene, seed, inbetweens, psnr, ended="finished"):
     scores = {"lowlight": {"psnr": psnr, "ssim": 0.9}, "gaussians": 10}
-    return {"scene": f"/scenes/{scene}", "varied": {"seed": seed, **inbetweens}, "ended": "finished", "scores": scores}
+    found = {"name": f"{scene}-{seed}", "scene": f"/scenes/{scene}", "varied": {"seed": seed, **inbetweens}}
+    return found | {"ended": ended, "scores": scores}
 
 
 def test_its_table_has_means_and_spreads_over_seeds(tmp_path):
@@ -46,6 +47,21 @@ def test_its_table_has_means_and_spreads_over_seeds(tmp_path):
     kept = json.loads((tmp_path / "table.json").read_text())
     assert kept[1]["scenes"]["toys"]["low"] == [35.0, 35.2]
     assert table.markdown(table.collect([tmp_path / "table.json"])) == ran.stdout
+
+
+def test_a_seed_that_diverged_is_named_and_not_counted(tmp_path, capsys):
+    ends = ("finished", "diverged at step 7")
+    members = [member("toys", seed, {}, 36.0 + seed, ended) for seed, ended in enumerate(ends)]
+    members.append(member("toys", 2, {"inbetweens": 0.0}, 35.0, ends[1]))
+    (tmp_path / "results.json").write_text(json.dumps({"members": members}))
+    assert table.markdown(table.collect([tmp_path])).splitlines()[2:] == [
+        "| the preset | 1 | 36.00 |",
+        "| inbetweens 0.0 | 0 |  |",
+    ]
+    named = capsys.readouterr().err
+    assert "toys-1 (diverged at step 7)" in named
+    assert "toys-2 (diverged at step 7)" in named
+    assert "toys-0" not in named
 
 
 def test_a_single_combination_has_a_row_for_each_scene():
