@@ -27,6 +27,7 @@ SCORES = {
     "still": ("lowlight_regions", "static", "psnr"),
     "lit": ("welllit", "overall", "psnr"),
     "gain": ("welllit", "overall", "psnr_gain"),
+    "moving gain": ("welllit", "dynamic", "psnr_gain"),
     "SSIM": ("welllit", "overall", "ssim"),
 }
 

@@ -83,6 +83,7 @@ def test_a_run_leaves_what_it_promises(finished):
     assert "Gaussians" in done.stderr
 
 
+@pytest.mark.slow
 def test_a_killed_run_resumes_to_the_same_result(scene, environment, finished, tmp_path):
     folder = tmp_path / "run"
     arguments = command(scene, "--output", folder, *TINY)

@@ -195,8 +195,12 @@ def test_linear_growth_keeps_scales_from_exploding():
         moved = moved_at(params._replace(heads=heads), cfg=linear, cameras=cameras, moving=True)
         expected = canonical * np.where(x > 0, 1 + x, np.exp(np.minimum(x, 0)))
         np.testing.assert_allclose(moved.scales, expected, rtol=1e-12)
-    scaled = lambda params: moved_at(params, cfg=linear, cameras=cameras, moving=True).scales
-    check_grads(scaled, (params,), 1, ["rev"], eps=1e-6)
+    scaled = lambda head: (
+        moved_at(
+            params._replace(heads=params.heads._replace(scale=head)), cfg=linear, cameras=cameras, moving=True
+        ).scales
+    )
+    check_grads(scaled, (scales,), 1, ["rev"], eps=1e-6)
 
 
 def test_without_its_head_the_opacity_does_not_depend_on_time():

@@ -170,6 +170,7 @@ def test_a_small_pair_buffer_grows_and_changes_nothing(dataset, finished):
         np.testing.assert_allclose(x, y, rtol=1e-6, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_stage_compiles_once_and_dead_rows_are_inert(dataset):
     config = tiny(density=DensityConfig(start=1000))
     compiled = engine.train_steps._cache_size()
