@@ -25,6 +25,7 @@ from l2dgs_jax.viewer.turns import Turns
 from l2dgs_jax.visualize import films
 
 USUAL_WINDOW = 1280, 720  # pixels
+LONGEST_REST = 2.0  # seconds for which others have the processor to themselves after a picture
 
 
 class Server(NamedTuple):
@@ -72,7 +73,8 @@ def serve(run: Run, host: str, port: int, share: float = 1.0) -> Iterator[Server
         run: what to show.
         host: address to listen at, see `check`.
         port: to listen at, or the next that is free.
-        share: of the time that drawing may take. Below 1, pictures remain as small and coarse as those that move.
+        share: of the time that drawing may take, as long as a picture does not take more than that of `LONGEST_REST`.
+            Below 1, pictures remain as small and coarse as those that move.
 
     Yields:
         The server.
@@ -121,7 +123,7 @@ def serve(run: Run, host: str, port: int, share: float = 1.0) -> Iterator[Server
             except Exception:  # a picture that fails is no reason to stop showing others
                 traceback.print_exc()
             if share < 1:
-                over.wait((time.monotonic() - begun) * (1 / share - 1))
+                over.wait(min((time.monotonic() - begun) * (1 / share - 1), LONGEST_REST))
 
     thread = threading.Thread(target=draw, name="draw")
     thread.start()
