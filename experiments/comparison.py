@@ -15,7 +15,7 @@ import numpy as np
 import tyro
 from jaxtyping import UInt8
 
-from experiments.members import FINISHED, Member, labels
+from experiments.members import Member, labels
 from experiments.web_page import write_page
 from l2dgs_jax.data.images import encode_jpeg, to_bytes
 from l2dgs_jax.data.parsing import read_json, value
@@ -72,7 +72,7 @@ def _members(study: Path) -> dict[str, dict[str, Member]]:
         if name in (INPUT, TRUTH):
             raise UserError(f"{path}: a variant is called {name!r}, as other pictures are; expected another name there")
         if member["varied"]["seed"] == members[0]["varied"]["seed"]:
-            name += "" if member["ended"] == FINISHED else f" ({member['ended']})"
+            name += "" if member["ended"] == report.FINISHED else f" ({member['ended']})"
             scenes.setdefault(member["scene"], {})[name] = member
     return scenes
 

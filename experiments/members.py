@@ -4,8 +4,9 @@ from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from typing import Any
 
+from l2dgs_jax.study.report import FINISHED
+
 Member = dict[str, Any]
-FINISHED = "finished"  # how a member ended that did not diverge
 
 
 def labels(members: Sequence[Member]) -> dict[str, str]:

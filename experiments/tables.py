@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import tyro
 
-from experiments.members import FINISHED, Member, labels, left_out
+from experiments.members import Member, labels, left_out
 from experiments.published import MEASURES, REGIONS, Cells
 from l2dgs_jax.config import overrides
 from l2dgs_jax.metrics import Convention, Lpips, Network
@@ -75,7 +75,7 @@ def _score_again(study: Path, lpips: dict[Network, Lpips]) -> None:
     """Score what is finished with LPIPS too, unless that was done before."""
     members = _members(study)
     for member in members:
-        if member["ended"] == FINISHED and member["scores"]["region_convention"] != CONVENTION:
+        if member["ended"] == report.FINISHED and member["scores"]["region_convention"] != CONVENTION:
             scores = evaluate(open_run(study / member["name"]), lpips=lpips, convention=CONVENTION)
             path = study / member["name"] / report.RESULT
             write_json(path, json.loads(path.read_text()) | {"scores": scores})
@@ -105,7 +105,7 @@ def collect(members: Sequence[Member], cells: Callable[[dict[str, Any]], Cells])
     groups: dict[str, dict[str, list[Cells]]] = {}
     for member in members:
         group = groups.setdefault(Path(member["scene"]).name, {}).setdefault(names[member["name"]], [])
-        if member["ended"] == FINISHED:
+        if member["ended"] == report.FINISHED:
             group.append(cells(member["scores"]))
     return {scene: {label: means(scores) for label, scores in rows.items()} for scene, rows in groups.items()}
 
@@ -160,7 +160,7 @@ def _text(value: float | None, measure: str) -> str:
 
 def write(options: Options, name: str, members: Sequence[Member], content: Any, markdown: str) -> None:
     """Leave a table's numbers in NAME.json and itself, with what must be known of it, in NAME.md, and print it."""
-    conventions = {member["scores"]["region_convention"] for member in members if member["ended"] == FINISHED}
+    conventions = {member["scores"]["region_convention"] for member in members if member["ended"] == report.FINISHED}
     if conventions:
         shown = " or ".join(sorted(conventions))
         markdown += f"\nOur regions are scored by the convention {shown}, see docs/metrics.md.\n"

@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 import tyro
 
-from experiments.members import FINISHED, left_out
+from experiments.members import left_out
+from l2dgs_jax.study.report import FINISHED
 
 Row = tuple[tuple[str, str], ...]  # names and values of settings
 Found = dict[Row, dict[str, dict[str, list[float]]]]  # scores over the seeds, by settings, scene and name

@@ -11,6 +11,7 @@ from l2dgs_jax.runtime.files import replacing, write_json
 
 JSON, MARKDOWN, PLOTS = "results.json", "results.md", "results.png"
 RESULT = "result.json"  # in the folder of a member
+FINISHED = "finished"  # how a member ended that did not diverge
 
 _SCORES = {
     "low-light PSNR": ("lowlight", "psnr"),

@@ -171,7 +171,7 @@ def _score(trial: Trial, output: Path) -> None:
         "scene": trial.plan.scene,
         "variant": trial.plan.variant,
         "varied": trial.plan.varied,
-        "ended": f"diverged at step {int(state.step)}" if diverged else "finished",
+        "ended": f"diverged at step {int(state.step)}" if diverged else report.FINISHED,
         "scores": evaluate(run),
     }
     write_json(path, result)
