@@ -92,9 +92,9 @@ def _train(options: Train) -> None:
     folder, config, first = options.output, options.config, jax.process_index() == 0
     assert folder is not None
     _check_devices(options)
-    if options.tensorboard:
+    if options.tensorboard and first:
         tensorboardx()
-    if options.view:
+    if options.view and first:
         check(options.view_host, options.view_port, "view-")
     with contextlib.ExitStack() as stack:
         if options.resume and first:
