@@ -6,12 +6,15 @@ from typing import Any
 from l2dgs_jax.runtime.files import replacing
 from l2dgs_jax.runtime.pages import filled, script_json
 
+_ELEMENT = Path(__file__).with_name("element.js")
+
 
 def write_page(path: Path, template: Path, data: Any) -> None:
-    """Fill the hole __DATA__ of a template, which stands in a script element.
+    """Fill the holes __DATA__ and __ELEMENT__ of a template, which stand in script elements.
 
     Raises:
         UserError: the page cannot be written.
     """
     with replacing(path) as temporary:
-        temporary.write_text(filled(template.read_text(), data=script_json(data)))
+        page = filled(template.read_text(), data=script_json(data), element=_ELEMENT.read_text())
+        temporary.write_text(page)

@@ -48,7 +48,7 @@ class Train:
         preset: settings to start from, which the options below override one by one; the defaults shown here are the
             preset's. Their steps: demo 400, fast 600, default 1200 (about five minutes on one core for frames of
             200x112, and more with pixels and points), best 5000, authors 17000, paper 23000; to compare with, 1200
-            each: 4dgs, enhance-4dgs, static.
+            each: 4dgs, enhance-4dgs, curve-4dgs, static.
         output: run folder; a fresh one under runs/ if not given.
         resume: continue the run in the output folder from its last checkpoint.
         devices: how many devices the views of a step are spread over; each core of a processor is one. If not given,
@@ -92,9 +92,9 @@ def _train(options: Train) -> None:
     folder, config, first = options.output, options.config, jax.process_index() == 0
     assert folder is not None
     _check_devices(options)
-    if options.tensorboard:
+    if options.tensorboard and first:
         tensorboardx()
-    if options.view:
+    if options.view and first:
         check(options.view_host, options.view_port, "view-")
     with contextlib.ExitStack() as stack:
         if options.resume and first:

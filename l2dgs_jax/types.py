@@ -147,11 +147,27 @@ class BAFENet(NamedTuple):
     out: Conv
 
 
+class ToneCurves(NamedTuple):
+    """Curves from well-lit to dark values (`model/tone_curves.py`), as logarithms of what each of R ramps rises by.
+
+    Attributes:
+        shared: of all views.
+        offsets: what is added to it for each training frame.
+    """
+
+    shared: Float[Array, "*B R"]
+    offsets: Float[Array, "*B F R"]
+
+
 class SceneParams(NamedTuple):
     """Everything that is learned.
 
-    Of these, `exposures` says nothing of the scene but of the frames that it was learned from, and takes no part in
-    rendering: logarithms of the gains of the training frames' channels, None if the camera's exposure did not change.
+    Two of these say nothing of the scene but of the frames that it was learned from.
+
+    Attributes:
+        exposures: logarithms of the gains of the training frames' channels, which take no part in rendering; None if
+            the camera's exposure did not change.
+        curves: how the frames became dark, in scenes whose low light is a curve of the well-lit image; None in others.
     """
 
     gaussians: Gaussians
@@ -160,6 +176,7 @@ class SceneParams(NamedTuple):
     ocd: OCDNet
     bafe: BAFENet
     exposures: Float[Array, "*B F 3"] | None = None
+    curves: ToneCurves | None = None
 
 
 class Scene(NamedTuple):

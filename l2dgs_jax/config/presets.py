@@ -1,8 +1,8 @@
 """The named presets; docs/presets.md says why each setting of `default` is what it is, and what it measures.
 
 `paper` is the text of the paper to the letter, `authors` what the authors' released code does, `default` what measures
-best, `fast` and `demo` a short `default`, `best` a long one. `4dgs`, `enhance-4dgs` and `static` are what to compare it
-with: baselines of the paper's Table 1, in as many steps.
+best, `fast` and `demo` a short `default`, `best` a long one. `4dgs`, `enhance-4dgs`, `curve-4dgs` and `static` are what
+to compare it with: baselines after those of the paper's Table 1, in as many steps.
 """
 
 import dataclasses
@@ -125,6 +125,13 @@ def _presets() -> dict[str, Config]:
         ),
         density=default.density,
     )
+    # The colours, tone curves and priors of Luminance-GS (arXiv 2504.01503), as far as they are model/tone_curves.py.
+    curve = dataclasses.replace(
+        four_d,
+        model=dataclasses.replace(four_d.model, decomposition="curve", background=0.0),
+        # A quarter, on the images themselves, is its 0.2 of SSIM to 0.8 of the difference; 1 to 5 are its later priors.
+        loss=dataclasses.replace(four_d.loss, ssim=0.25, eta_start=1.0, eta_end=1.0, equalisation=0.01, bend=0.05),
+    )
     # The first stage, in which nothing moves, for as long as `default`; paths would move.
     static = dataclasses.replace(
         default,
@@ -141,6 +148,7 @@ def _presets() -> dict[str, Config]:
         "demo": demo,
         "4dgs": four_d,
         "enhance-4dgs": dataclasses.replace(four_d, enhance="zero-dce"),
+        "curve-4dgs": curve,
         "static": static,
     }
 

@@ -69,6 +69,7 @@ RATE_GROUPS = (
     "paths",
     "lifetimes",
     "exposures",
+    "curves",
 )
 
 
@@ -115,8 +116,9 @@ class ModelConfig:
     exposure: Literal["steady", "drifting", "auto"] = "steady"
     background: float = 0.0  # value of L and R where nothing is drawn
     # "retinex": Eqs. 5-9; "none": colours by spherical harmonics, as 4DGS (arXiv 2310.08528) has them, are both the
-    # low-light and the well-lit image (Table 1, 4DGS)
-    decomposition: Literal["retinex", "none"] = "retinex"
+    # low-light and the well-lit image (Table 1, 4DGS); "curve": they are the well-lit image, and a learned tone curve
+    # of it is the low-light one (model/tone_curves.py)
+    decomposition: Literal["retinex", "none", "curve"] = "retinex"
     ocd: bool = True  # whether OCD-Net lights Gaussians anew at every instant; otherwise a_j = 1 (Table 3, w/o OCD-Net)
     # Whether B1 and B2 come from BAFE-Net; otherwise from the blended features alone, brought to the same range (Table
     # 3, w/o BAFE-Net)
@@ -162,6 +164,9 @@ class LossConfig:
     opacity: Number = 0.0  # mean opacity
     scale: Number = 0.0  # mean scale, in the unit of lengths
     gate: Number = 0.0  # mean factor on motion, fine stage only
+    # With tone curves: how far they are from those that leave well-lit images flat histograms, and from power laws
+    equalisation: Number = 0.0
+    bend: Number = 0.0
 
 
 @dataclass(frozen=True)
@@ -190,6 +195,7 @@ class OptimConfig:
     paths_lr: Number = 1e-3
     lifetimes_lr: Number = 0.0
     exposures_lr: Number = 1e-3
+    curves_lr: Number = 1e-3
     decay_steps: Length = 20_000  # length of the decays; None: the length of the stage
     beta1: Number = 0.9
     beta2: Number = 0.999

@@ -155,8 +155,9 @@ def near_plane(run: Run) -> float:
 
 
 def background(run: Run) -> float:
-    """What the colours are to be blended over, sRGB."""
-    return run.config.model.background**2
+    """What the colours are to be blended over, sRGB: the well-lit image where nothing is drawn."""
+    model = run.config.model
+    return model.background**2 if model.decomposition == "retinex" else model.background  # Eq. 7: L R
 
 
 def _exact(renderer: Renderer, cameras: Camera, kinds: tuple[Image, ...]) -> Float[Array, "V H W C"]:

@@ -9,7 +9,7 @@ LEVELS = 2**14  # of a prediction, which decide where it saturates
 
 
 def best_gain(frames: Iterable[tuple[Float[np.ndarray, "..."], Float[np.ndarray, "..."]]]) -> float:
-    """The one factor g >= 0 that minimises the mean of (min(g p, 1) - t)^2; 1 if every prediction is 0.
+    """The one factor g >= 0 that minimises the mean of (min(g p, 1) - t)^2; 1 if every prediction is 0, NaN if one is.
 
     Saturated values stop to count against a larger factor, as they do to the eye. Between the factors at which one more
     value saturates the error is a parabola, so its least value is found exactly, but for values rounded to `LEVELS`.
@@ -20,6 +20,8 @@ def best_gain(frames: Iterable[tuple[Float[np.ndarray, "..."], Float[np.ndarray,
     square, product, beyond = np.zeros((3, LEVELS))  # sums of p^2, p t and 1 - 2 t, over the values of a level
     for prediction, truth in frames:
         p, t = (np.asarray(x, np.float64).ravel() for x in (prediction, truth))
+        if not np.isfinite(p).all():
+            return float("nan")
         level = np.minimum((p * LEVELS).astype(int), LEVELS - 1)
         square += np.bincount(level, p * p, LEVELS)
         product += np.bincount(level, p * t, LEVELS)

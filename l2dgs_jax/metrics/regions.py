@@ -42,13 +42,14 @@ def compare(
 
     Returns:
         The scores of "overall", given `dynamic` of "dynamic" and "static", and given `covisible` of "covisible", always
-        "masked", those of them that have any pixel. None is a score that cannot be had of so few pixels; "area" is the
-        region's part of the frame.
+        "masked", those of them that have any pixel. None is a score that cannot be had of so few pixels, NaN any of a
+        frame whose counted pixels are not all finite; "area" is the region's part of the frame.
     """
     prediction, truth = np.asarray(prediction), np.asarray(truth, prediction.dtype)
     masks = region_masks(prediction.shape[:2], dynamic, valid, covisible)
     truth = np.where(masks["overall"][..., None], truth, prediction)
-    whole = {name: measure.maps(prediction, truth) for name, measure in measures.items()}
+    finite = np.isfinite((prediction - truth)[masks["overall"]]).all()
+    whole = {name: measure.maps(prediction, truth) for name, measure in measures.items()} if finite else {}
 
     def score(name: str, region: str) -> float:
         measure, mask = measures[name], masks[region]
@@ -59,7 +60,8 @@ def compare(
         return _score_alone(measure, prediction, truth, mask) if alone else mean_score(whole[name], measure, mask)
 
     return {
-        region: {name: _known(score(name, region)) for name in measures} | {"area": float(mask.mean())}
+        region: {name: known(score(name, region)) if finite else np.nan for name in measures}
+        | {"area": float(mask.mean())}
         for region, mask in masks.items()
         if mask.any()
     }
@@ -79,12 +81,12 @@ def region_masks(
 
 
 def summarise(frames: Sequence[Mapping[str, Score]]) -> dict[str, Score]:
-    """Means per region and score, each over the frames that have it; None if no frame has."""
+    """Means per region and score, each over the frames that have it; None if no frame has, or if one of them is NaN."""
     summary: dict[str, Score] = {}
     for region in dict.fromkeys(region for frame in frames for region in frame):
         scored = [frame[region] for frame in frames if region in frame]
-        known = {key: [value for score in scored if (value := score[key]) is not None] for key in scored[0]}
-        summary[region] = {key: float(np.mean(values)) if values else None for key, values in known.items()}
+        had = {key: [value for score in scored if (value := score[key]) is not None] for key in scored[0]}
+        summary[region] = {key: known(float(np.mean(values))) if values else None for key, values in had.items()}
     return summary
 
 
@@ -97,5 +99,6 @@ def _score_alone(
     return mean_score(measure.maps(prediction * seen, truth * seen), measure, mask)
 
 
-def _known(score: float) -> float | None:
+def known(score: float) -> float | None:
+    """A score, or None for NaN, which JSON lacks."""
     return None if np.isnan(score) else score

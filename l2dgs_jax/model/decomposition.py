@@ -24,12 +24,13 @@ def decompose(features: Float[Array, "*B H W 6"], bafe: BAFENet, cfg: ModelConfi
 
     Returns:
         The images of Eqs. 5-9; a base of 0 stays 0 in the low-light image and passes no gradient to its exponent.
-        Without a decomposition both images are the blended colour, and L_w and the exponents are 1.
+        Without a decomposition both images are the blended colour, and L_w and the exponents are 1; `render` then puts
+        what a tone curve says in place of the low-light image.
     """
     # Without a boundary the losses' gradient would be computed again for each of the channels.
     illumination, reflectance, attenuation = fusion_boundary(channels.unpack)(features)
     illumination, reflectance = clip_unit(illumination), clip_unit(reflectance)
-    if cfg.decomposition == "none":
+    if cfg.decomposition != "retinex":
         return Decomposition(
             welllit=reflectance,
             lowlight=reflectance,

@@ -15,7 +15,8 @@ from l2dgs_jax.cameras.geometry import camera_extent, median_depth
 from l2dgs_jax.config import ModelConfig
 from l2dgs_jax.model import hexplane, networks
 from l2dgs_jax.model.deformation import length_unit
-from l2dgs_jax.types import Camera, Gaussians, Scene, SceneParams
+from l2dgs_jax.model.tone_curves import RAMPS
+from l2dgs_jax.types import Camera, Gaussians, Scene, SceneParams, ToneCurves
 
 SH_DC = 0.28209479177387814  # value of the first SH basis function
 LUMINANCE = np.array([0.2989, 0.587, 0.114])
@@ -71,6 +72,7 @@ def initialise(
     reflectance: np.ndarray | None = None,
     exposures: np.ndarray | None = None,
     seeds: Seeds | None = None,
+    curve: np.ndarray | None = None,
 ) -> Scene:
     """A scene with one Gaussian a point, and then one a seed, ready for training.
 
@@ -88,6 +90,7 @@ def initialise(
         reflectance: [P + S 3] initial reflectance, for `cfg.reflectance_init` "observed".
         exposures: [F 3] logarithms of the frames' gains to start from, for `cfg.exposure` "drifting".
         seeds: S of them, for `cfg.tracks`.
+        curve: [R] what all frames' tone curves start from, for `cfg.decomposition` "curve".
     """
     distances, _ = cKDTree(points).query(points, k=min(4, len(points)))
     mean_square = np.square(distances[:, 1:]).mean(-1) if len(points) > 1 else np.ones(1)
@@ -118,6 +121,7 @@ def initialise(
         bias,
         extent,
         exposures,
+        curve,
         paths,
         lifetimes,
     )
@@ -137,7 +141,7 @@ def scene_shapes(cfg: ModelConfig, num_frames: int) -> Scene:
         cfg: shape of the scene.
         num_frames: training frames.
     """
-    shapes: tuple = ((1, 3), (2, 3), (1,), (1,), (1,), (1, 3), (2,), (), (num_frames, 3))
+    shapes: tuple = ((1, 3), (2, 3), (1,), (1,), (1,), (1, 3), (2,), (), (num_frames, 3), (RAMPS,))
     if cfg.tracks:
         shapes += ((1, path_knots(num_frames), 3), (1, 2))
     rows = [jax.ShapeDtypeStruct(shape, jnp.zeros(()).dtype) for shape in shapes]
@@ -170,6 +174,7 @@ def _initialise(
     exponent_bias: Float[Array, "2"] | None,
     extent: Float[Array, ""],
     exposures: Float[Array, "F 3"] | None,
+    curve: Float[Array, " R"] | None,
     paths: Float[Array, "P K 3"] | None = None,
     lifetimes: Float[Array, "P 2"] | None = None,
     *,
@@ -193,7 +198,7 @@ def _initialise(
         gate=jnp.full(count, OPEN_GATE, float) if cfg.motion_gate else None,
         paths=paths,
         lifetimes=lifetimes,
-        color_rest=jnp.zeros((count, 3, num_rest)) if cfg.decomposition == "none" else None,
+        color_rest=jnp.zeros((count, 3, num_rest)) if cfg.decomposition != "retinex" else None,
     )
     params = SceneParams(
         gaussians=jax.tree.map(lambda rows: pad_rows(rows, capacity), gaussians),
@@ -202,6 +207,7 @@ def _initialise(
         ocd=networks.init_ocd(keys[4], cfg),
         bafe=networks.init_bafe(keys[5], exponent_bias),
         exposures=exposures if cfg.exposure == "drifting" else None,
+        curves=ToneCurves(curve, jnp.zeros((num_frames, RAMPS))) if cfg.decomposition == "curve" else None,
     )
     return Scene(
         params=params,

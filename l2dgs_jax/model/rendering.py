@@ -13,6 +13,7 @@ from l2dgs_jax.config import ModelConfig
 from l2dgs_jax.model import channels
 from l2dgs_jax.model.decomposition import decompose
 from l2dgs_jax.model.deformation import deform, length_unit
+from l2dgs_jax.model.tone_curves import darkened
 from l2dgs_jax.rasterizer import rasterize
 from l2dgs_jax.rasterizer.rasterization import LEAST_ALPHA, NEAR_PLANE
 from l2dgs_jax.runtime.capacity import next_capacity
@@ -71,8 +72,12 @@ def render(
     if cfg.background:
         lit = channels.LIT[None, None, None]
         features = features + cfg.background * jnp.where(lit, 1 - drawn.alpha[..., None], 0)
+    images, curves = decompose(features, scene.params.bafe, cfg), scene.params.curves
+    if curves is not None:
+        shared = jnp.broadcast_to(curves.shared[None], (len(features), *curves.shared.shape))
+        images = images._replace(lowlight=darkened(images.welllit, shared))
     return RenderOutput(
-        images=decompose(features, scene.params.bafe, cfg),
+        images=images,
         alpha=drawn.alpha,
         depth=drawn.depth,
         radii=drawn.radii,

@@ -22,6 +22,7 @@ from l2dgs_jax.runtime.files import flush, replacing
 from l2dgs_jax.training.initial_state import state_shapes
 from l2dgs_jax.training.step import TrainState
 
+_STEP = ".step"  # of the arrays in a file, that of `TrainState.step`
 VERSION = 2  # of the files; those of version 1 have no version and no halvings
 
 # What a reader of zip, npy and JSON stumbles over in a file that is not what it should be.
@@ -88,6 +89,23 @@ def kept(path: Path) -> list[Path]:
     name = re.compile(rf"{re.escape(path.stem)}-(\d+){re.escape(path.suffix)}")
     earlier = {int(found[1]): file for file in path.parent.glob("*") if (found := name.fullmatch(file.name))}
     return [*([path] if path.exists() else []), *(file for _, file in sorted(earlier.items()))]
+
+
+def drop_after(path: Path, step: int) -> None:
+    """Remove the checkpoints of later steps; files that are damaged stay.
+
+    Args:
+        path: where the last one should be.
+        step: number of finished steps.
+    """
+    for file in kept(path):
+        try:
+            with zipfile.ZipFile(file) as archive:
+                later = _read(archive, _STEP) > step
+        except DAMAGE:
+            continue
+        if later:
+            file.unlink()
 
 
 def load_last(path: Path, config: Config, num_frames: int, skip: int = 0) -> Checkpoint:

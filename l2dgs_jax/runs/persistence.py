@@ -8,12 +8,12 @@ import jax
 from l2dgs_jax.config import Config
 from l2dgs_jax.data import Dataset
 from l2dgs_jax.errors import DIVERGED, Interrupted, UserError
-from l2dgs_jax.runs import previews
+from l2dgs_jax.runs import checkpoints, previews
 from l2dgs_jax.runs.checkpoints import Checkpoint
 from l2dgs_jax.runs.displays import Display
-from l2dgs_jax.runs.divergence import HALVINGS, explosion, halve_rates, rate_factor, standing
+from l2dgs_jax.runs.divergence import HALVINGS, SUSTAINED, explosion, halve_rates, rate_factor, standing
 from l2dgs_jax.runs.fitting import fit
-from l2dgs_jax.runs.folder import read_metrics
+from l2dgs_jax.runs.folder import CHECKPOINT, read_metrics
 from l2dgs_jax.runs.pace import Pace
 from l2dgs_jax.runs.recorder import Recorder
 from l2dgs_jax.runs.run import Run
@@ -85,7 +85,7 @@ def _fit(
     record = Recorder(folder, config, done, start.halvings)
     previews.drop_after(folder, done)
     drawn_at = previews.moments(config) if with_previews else frozenset()
-    losses = [line["loss"] for line in read_metrics(folder)]
+    lines = read_metrics(folder)
     pace = Pace(config, done, int(start.state.scene.alive.sum()))
 
     def on_step(progress: Progress) -> None:
@@ -93,9 +93,11 @@ def _fit(
         display("step", step=record.step, stage=config.stage_of(record.step), left=pace(record.step))
         if line:
             display("metrics", **line)
-            losses.append(line["loss"])
-            grown = explosion(losses)
+            lines.append(line)
+            grown = explosion([line["loss"] for line in lines])
             if grown and jax.process_count() == 1:
+                # To go back to what has exploded already would be to halve the rates in vain.
+                checkpoints.drop_after(folder / CHECKPOINT, lines[-1 - SUSTAINED]["step"])
                 raise DivergedError(f"by step {record.step} the loss has grown {grown:.0f}-fold", progress)
         if record.step in drawn_at:
             files = previews.draw(folder, dataset, config, devices.member(progress.states, 0))

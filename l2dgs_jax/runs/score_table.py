@@ -33,7 +33,8 @@ def table(result: dict) -> str:
     if "gain" not in result:
         lines.append("the scene has no well-lit truth to compare with")
     else:
-        lines.append(f"gain {result['gain']:.3f}, of the dark frame {result['dark_frame_gain']['gain']:.3f}")
+        gain = "unknown" if result["gain"] is None else f"{result['gain']:.3f}"
+        lines.append(f"gain {gain}, of the dark frame {result['dark_frame_gain']['gain']:.3f}")
         lines += _after_gain(result["welllit"]["overall"])
     lines += _warping(result["temporal"]["regions"].get("overall", {}))
     return "\n".join(lines)

@@ -1,7 +1,10 @@
 """How well the views of a run match the input and, where known, the truth."""
 
 import dataclasses
+import warnings
 from collections.abc import Iterator, Mapping
+from functools import partial
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Float, Float16
@@ -15,6 +18,8 @@ from l2dgs_jax.runs.run import Run
 from l2dgs_jax.runs.steadiness import steadiness
 from l2dgs_jax.runs.views import get_split, views
 from l2dgs_jax.runtime.prefetch import prefetch
+
+T = TypeVar("T")
 
 _WELLLIT = metrics.BASIC | {"ssim_3dgs": metrics.SSIM_3DGS, "ms_ssim": metrics.MS_SSIM, "flip": metrics.FLIP}
 
@@ -38,8 +43,9 @@ def evaluate(
         convention: how regions are scored, see `metrics.compare`.
 
     Returns:
-        What can be written as JSON; None is a score that cannot be had, "area" a region's part of the pixels of the
-        frames that show it:
+        What can be written as JSON; None is a score that cannot be had, be it that a frame came out with values that
+        are not finite, of which a warning then tells; "area" is a region's part of the pixels of the frames that show
+        it:
 
         * "split", "stage", "step", "gaussians", "frames": what was scored;
         * "region_convention": how;
@@ -65,7 +71,6 @@ def evaluate(
     if split.valid is not None and not any(frame.any() for frame in split.valid):
         raise UserError(f"{run.name}: no pixel of its scene's {split_name} views is valid; expected some to score")
     drifting = run.state.scene.params.exposures is not None
-    lowlight = []
 
     def exposed(estimate: Float[np.ndarray, "H W 3"], index: int) -> Float[np.ndarray, "H W 3"]:
         """As its frame's camera exposed it, if exposures differ: nobody has told that of frames not trained on."""
@@ -73,14 +78,21 @@ def evaluate(
             return estimate
         return metrics.best_gain([_counted(estimate, split.images, split, index)]) * estimate
 
-    def relit() -> Iterator[Float16[np.ndarray, "H W 3"]]:
-        """The well-lit views, as compact as the data set's own; the low-light ones are scored on the way."""
+    def drawn() -> Iterator[tuple[Float16[np.ndarray, "H W 3"], _Lowlight]]:
+        """The well-lit views, as compact as the data set's own, and what is kept of the low-light ones."""
         for index, output in enumerate(views(run, split.cameras)):
-            estimate = np.asarray(output.images.lowlight)
-            lowlight.append(_compare(exposed(estimate, index), split.images, split, index, metrics.BASIC, convention))
-            yield np.asarray(output.images.welllit, np.float16)
+            images = output.images
+            pixels = (_counted(np.asarray(x), split.images, split, index)[0] for x in (images.welllit, images.lowlight))
+            finite = all(np.isfinite(values).all() for values in pixels)
+            estimate = exposed(np.asarray(images.lowlight), index)
+            scores = _compare(estimate, split.images, split, index, metrics.BASIC, convention)
+            yield np.asarray(images.welllit, np.float16), _Lowlight(scores, finite)
 
-    welllit = stacked(relit(), split.images.shape, np.float16, in_file=isinstance(split.images, MappedArray))
+    welllit, lowlight = _apart(drawn(), split)
+    broken = [name for name, view in zip(split.names, lowlight, strict=True) if not view.finite]
+    if broken:
+        frames = ", ".join(broken)
+        warnings.warn(f"{run.name}: not finite, and without a score: {split_name} views {frames}", stacklevel=2)
     result: dict = {
         "split": split_name,
         "stage": "fine" if run.moving else "coarse",
@@ -90,42 +102,75 @@ def evaluate(
         "region_convention": convention,
     }
     if run.config.enhance == "none":
-        scores = metrics.summarise(lowlight)
+        scores = metrics.summarise([view.scores for view in lowlight])
         result |= {"lowlight_gain": "own" if drifting else "none", "lowlight": scores.pop("overall")}
         if scores:
             result["lowlight_regions"] = scores
     if split.masks is not None:
         result["mask_area"] = float(pixel_mean(split.masks, split.valid))
+    gain = None
     if split.welllit is not None:
         networks = {f"lpips_{name}": metrics.lpips_measure(name, (lpips or {}).get(name)) for name in metrics.NETWORKS}
-        plain, gained, gain = _with_gain(welllit, split.welllit, split, _WELLLIT | networks, convention)
-        result |= {"welllit": {region: plain[region] | gained[region] for region in plain}, "gain": gain}
+        gain = _best_gain(welllit, split.welllit, split)
+        compared = partial(_scores, welllit, split.welllit, split, _WELLLIT | networks, convention)
+        plain, gained = compared(1.0), _named_gain(compared(gain))
+        result |= {"welllit": {region: plain[region] | gained[region] for region in plain}, "gain": metrics.known(gain)}
         whole = dataclasses.replace(split, masks=None, covisible=None)
-        _, dark, dark_gain = _with_gain(split.images, split.welllit, whole, metrics.BASIC, convention)
-        result["dark_frame_gain"] = {"gain": dark_gain} | dark["overall"]
-    result["temporal"] = steadiness(welllit, split, result.get("gain"))
+        dark_gain = _best_gain(split.images, split.welllit, split)
+        dark = _scores(split.images, split.welllit, whole, metrics.BASIC, convention, dark_gain)
+        result["dark_frame_gain"] = {"gain": dark_gain} | _named_gain(dark)["overall"]
+    result["temporal"] = steadiness(welllit, split, gain)
     return result
 
 
-def _with_gain(
+class _Lowlight(NamedTuple):
+    """Of a view: how its low-light image scores, and whether all of its images have values."""
+
+    scores: dict[str, Score]
+    finite: bool
+
+
+def _apart(
+    pairs: Iterator[tuple[Float16[np.ndarray, "H W 3"], T]], split: Split
+) -> tuple[Float16[np.ndarray, "F H W 3"], list[T]]:
+    """The images as one array, in a file if those of the split are in one, and what comes with them as a list."""
+    others: list[T] = []
+
+    def images() -> Iterator[Float16[np.ndarray, "H W 3"]]:
+        for image, other in pairs:
+            others.append(other)
+            yield image
+
+    return stacked(images(), split.images.shape, np.float16, in_file=isinstance(split.images, MappedArray)), others
+
+
+def _best_gain(predictions: Float[np.ndarray, "F H W 3"], truths: Float[np.ndarray, "F H W 3"], split: Split) -> float:
+    return metrics.best_gain(_counted(p, truths, split, i) for i, p in enumerate(predictions))
+
+
+def _scores(
     predictions: Float[np.ndarray, "F H W 3"],
     truths: Float[np.ndarray, "F H W 3"],
     split: Split,
     measures: Mapping[str, Measure],
     convention: Convention,
-) -> tuple[dict[str, Score], dict[str, Score], float]:
-    """Scores per region without and with the one best gain, and that gain."""
+    factor: float,
+) -> dict[str, Score]:
+    """Scores per region of predictions times a factor."""
 
-    def scores(factor: float) -> dict[str, Score]:
-        def compare(index: int) -> dict[str, Score]:
-            prediction = np.float32(factor) * predictions[index].astype(np.float32)
-            return _compare(prediction, truths, split, index, measures, convention)
+    def compare(index: int) -> dict[str, Score]:
+        prediction = np.float32(factor) * predictions[index].astype(np.float32)
+        return _compare(prediction, truths, split, index, measures, convention)
 
-        return metrics.summarise(list(prefetch(compare, range(len(predictions)))))
+    return metrics.summarise(list(prefetch(compare, range(len(predictions)))))
 
-    gain = metrics.best_gain(_counted(p, truths, split, i) for i, p in enumerate(predictions))
-    gained = {region: {f"{name}_gain": score[name] for name in measures} for region, score in scores(gain).items()}
-    return scores(1.0), gained, gain
+
+def _named_gain(regions: dict[str, Score]) -> dict[str, Score]:
+    """The same scores under names that say that they are after the gain; areas are left out."""
+    return {
+        region: {f"{name}_gain": value for name, value in scores.items() if name != "area"}
+        for region, scores in regions.items()
+    }
 
 
 def _counted(

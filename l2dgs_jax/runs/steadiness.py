@@ -20,7 +20,7 @@ def steadiness(welllit: Float[np.ndarray, "F H W 3"], split: Split, gain: float 
         welllit: the well-lit images of the split's views.
         split: its truth, or where there is none its dark input, is what flow is found in.
         gain: what the images are multiplied by, before they are clipped to [0, 1], to be scored a second time; None
-            without truth.
+            without truth, NaN if images are not finite.
 
     Returns:
         What can be written as JSON:
@@ -30,14 +30,14 @@ def steadiness(welllit: Float[np.ndarray, "F H W 3"], split: Split, gain: float 
         * "regions": for "overall", "dynamic", "static" and "covisible", as far as the split marks them,
           "warping_error" of the images, "area", the part of the pixels that it was found in, and given a gain
           "warping_error_gain" of the images times it and "warping_error_truth" of the truth, which is what errors of
-          the flow and changes of light amount to.
+          the flow and changes of light amount to; each None if an image is not finite where it counts.
     """
     videos = {"warping_error": (welllit, 1.0)}
     source = split
     if split.welllit is not None and gain is not None:
         videos |= {"warping_error_gain": (welllit, gain), "warping_error_truth": (split.welllit, 1.0)}
         source = dataclasses.replace(split, images=split.welllit)
-    flows = neighbour_flows(source)
+    flows, nothing = neighbour_flows(source), np.broadcast_to(np.float16(0), welllit.shape)
 
     def shown(video: Float[np.ndarray, "F H W 3"], index: int, factor: float) -> Float[np.ndarray, "H W 3"]:
         image = np.clip(np.float32(factor) * video[index].astype(np.float32), 0, 1)
@@ -49,7 +49,7 @@ def steadiness(welllit: Float[np.ndarray, "F H W 3"], split: Split, gain: float 
             name: metrics.warping_error_map(shown(video, frame, factor), shown(video, after, factor), flow)
             for name, (video, factor) in videos.items()
         }
-        known = np.isfinite(errors["warping_error"])
+        known = np.isfinite(metrics.warping_error_map(shown(nothing, frame, 1.0), shown(nothing, after, 1.0), flow))
         marks = (None if x is None else x[frame] for x in (split.masks, split.valid, split.covisible))
         return {
             region: {name: _mean(error, mask & known) for name, error in errors.items()}

@@ -12,6 +12,7 @@ from l2dgs_jax.model import networks
 from l2dgs_jax.model.initialisation import initialise, scene_shapes, z_order
 from l2dgs_jax.model.observation import exposures, observed_colors
 from l2dgs_jax.model.tone import Darkening, darkening, recognise
+from l2dgs_jax.model.tone_curves import equalising_law, power_law
 from l2dgs_jax.runtime.capacity import next_capacity
 from l2dgs_jax.training.seeds import find_seeds
 from l2dgs_jax.training.step import TrainState, begin_stage
@@ -21,9 +22,14 @@ DRIFT = 0.05  # standard deviation of the logarithms of the frames' gains from w
 
 
 def split_darkening(split: Split, config: Config) -> Darkening:
-    """How the frames are darker than `config.loss.exposure_level`; not at all where low light is not modelled."""
+    """How the frames are darker than `config.loss.exposure_level`; not at all where low light is not modelled.
+
+    Where it is a tone curve, they are darker than they would be with a flat histogram.
+    """
     if config.model.decomposition == "none":
         return Darkening(1.0, 1.0)
+    if config.model.decomposition == "curve":
+        return equalising_law(split.images, split.valid)
     tone = config.model.tone
     if tone == "auto":
         tone = recognise(split.images, split.valid)
@@ -77,7 +83,8 @@ def initial_state(dataset: Dataset, config: Config) -> TrainState:
     if config.model.exposure == "drifting":
         gains = exposures(points, train.cameras, train.images, train.valid)
     key = jax.random.key(config.seed)
-    scene = initialise(key, points, colors, train.cameras, config.model, capacity, reflectance, gains, seeds)
+    curve = power_law(split_darkening(train, config)) if config.model.decomposition == "curve" else None
+    scene = initialise(key, points, colors, train.cameras, config.model, capacity, reflectance, gains, seeds, curve)
     return _begin_stage(scene, jnp.zeros((), jnp.int32), config, config.coarse_steps)
 
 

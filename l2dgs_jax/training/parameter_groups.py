@@ -40,6 +40,7 @@ def groups(params: SceneParams) -> SceneParams:
         ocd=label("ocd", params.ocd),
         bafe=label("bafe", params.bafe),
         exposures=label("exposures", params.exposures),
+        curves=label("curves", params.curves),
     )
 
 
@@ -68,6 +69,7 @@ def schedules(cfg: OptimConfig, extent: Float[Array, ""], stage_steps: int) -> d
         "paths": (cfg.paths_lr, cfg.paths_lr),
         "lifetimes": (cfg.lifetimes_lr, cfg.lifetimes_lr),
         "exposures": (cfg.exposures_lr, cfg.exposures_lr),
+        "curves": (cfg.curves_lr, cfg.curves_lr),
     }
     steps = jnp.maximum(stage_steps if cfg.decay_steps is None else cfg.decay_steps, 1)
     factor = lambda name: extent if name in cfg.extent_scales else jnp.ones_like(extent)

@@ -8,15 +8,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from l2dgs_jax.config import Config
-from l2dgs_jax.model import hexplane
+from l2dgs_jax.config import Config, LossConfig
+from l2dgs_jax.model import hexplane, tone_curves
 from l2dgs_jax.model.deformation import length_unit
 from l2dgs_jax.model.initialisation import pad_rows
 from l2dgs_jax.model.rendering import render
 from l2dgs_jax.training import densification, losses, optimizer, relocation
 from l2dgs_jax.training.densification import GrowthStats
 from l2dgs_jax.training.parameter_groups import groups, schedules
-from l2dgs_jax.types import Camera, Gaussians, Scene, SceneParams
+from l2dgs_jax.types import Camera, Gaussians, Scene, SceneParams, ToneCurves
 
 T = TypeVar("T")
 
@@ -123,15 +123,20 @@ def objective(
     cfg = config.loss
     start, steps = (config.coarse_steps, config.fine_steps) if moving else (0, config.coarse_steps)
     eta = losses.eta(state.step - start, steps, cfg) if cfg.eta_restarts else losses.eta(state.step, config.steps, cfg)
-    images = output.images._replace(lowlight=exposed(output.images.lowlight, params.exposures, batch.frames))
+    images = output.images
+    if params.curves is not None:
+        own = tone_curves.of_frames(params.curves, batch.frames)
+        images = images._replace(lowlight=tone_curves.darkened(images.welllit, own))
+    images = images._replace(lowlight=exposed(images.lowlight, params.exposures, batch.frames))
     target, counted = targets(batch, images.lowlight)
     measured = output._replace(images=images, depth=output.depth / length_unit(state.scene.extent, config.model))
     loss, terms = losses.total(measured, target, cfg, eta, exponent_target(config))
     if moving:
         smoothness, time_smoothness, time_l1 = hexplane.regularisers(params.hexplane)
         loss += cfg.plane_smoothness * smoothness + cfg.time_smoothness * time_smoothness + cfg.time_l1 * time_l1
-    size, sizes = losses.weighted_sum(size_terms(state.scene._replace(params=params), config, moving))
-    loss, terms = loss + size, terms | sizes
+    others = size_terms(state.scene._replace(params=params), config, moving) | curve_terms(params.curves, batch, cfg)
+    other, values = losses.weighted_sum(others)
+    loss, terms = loss + other, terms | values
     squares = jnp.mean(jnp.square(jax.lax.stop_gradient(images.lowlight) - target))
     mse = _mean(squares, axis) / _mean(counted, axis)
     report = StepReport(loss, terms, -10 * jnp.log10(mse), output.pairs, output.overflow, jnp.isfinite(loss))
@@ -158,6 +163,17 @@ def size_terms(scene: Scene, config: Config, moving: bool) -> losses.Terms:
         gate = gaussians.gate
         terms["gate"] = (cfg.gate, lambda: mean(jax.nn.sigmoid(gate)))
     return terms
+
+
+def curve_terms(curves: ToneCurves | None, batch: Batch, cfg: LossConfig) -> losses.Terms:
+    """Weight and value of what gives the frames' tone curves their shape."""
+    if curves is None:
+        return {}
+    own = tone_curves.of_frames(curves, batch.frames)
+    return {
+        "equalisation": (cfg.equalisation, lambda: tone_curves.equalisation(own, batch.images, batch.valid)),
+        "bend": (cfg.bend, lambda: tone_curves.bend(own)),
+    }
 
 
 def presence(state: TrainState, config: Config) -> Float[Array, " N"] | None:

@@ -21,6 +21,7 @@ from l2dgs_jax.evaluate import evaluate, main, table
 from l2dgs_jax.metrics.flip import flip_map
 from l2dgs_jax.metrics.lpips import SMALLEST
 from l2dgs_jax.runs.lpips_weights import load_lpips
+from l2dgs_jax.runs.views import views
 from l2dgs_jax.runtime import command_line
 
 
@@ -309,6 +310,26 @@ def test_pixels_that_do_not_count_are_left_out_and_covisible_ones_scored(run, re
     )
     assert "covisible" in table(found)
     assert "covisible" not in table(result)
+
+
+def test_a_frame_that_is_not_finite_is_named_and_leaves_no_mean(run, result, monkeypatch):
+    def spoiled(*arguments):
+        for index, output in enumerate(views(*arguments)):
+            images = output.images
+            if index == 1:
+                dots = np.where(np.arange(images.welllit.size).reshape(images.welllit.shape) % 50, 0, np.nan)
+                images = images._replace(welllit=images.welllit + dots, lowlight=images.lowlight + dots)
+            yield output._replace(images=images)
+
+    monkeypatch.setattr("l2dgs_jax.runs.scores.views", spoiled)
+    with pytest.warns(UserWarning, match=f"not finite, and without a score: test views {run.dataset.test.names[1]}$"):
+        found = evaluate(run)
+    assert found["lowlight"] == {"psnr": None, "ssim": None, "area": 1.0}
+    assert {score for name, score in found["welllit"]["static"].items() if name != "area"} == {None}
+    assert found["gain"] is found["temporal"]["regions"]["overall"]["warping_error"] is None
+    assert found["dark_frame_gain"] == result["dark_frame_gain"]
+    assert json.loads(json.dumps(found, allow_nan=False)) == found
+    assert "gain unknown" in table(found)
 
 
 def test_a_split_in_which_no_pixel_counts_is_refused(run):

@@ -150,6 +150,22 @@ def test_a_run_without_a_checkpoint_starts_from_the_beginning(scene, tmp_path, m
         train.main([str(scene), "--output", str(tmp_path / "run"), "--resume"])
 
 
+@pytest.mark.parametrize("process", [0, 1])
+def test_only_the_process_that_shows_and_writes_needs_what_that_takes(scene, tmp_path, monkeypatch, process):
+    asked = []
+
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(train, "load_dataset", stop)
+    monkeypatch.setattr(train, "tensorboardx", lambda: asked.append("tensorboard"))
+    monkeypatch.setattr(train, "check", lambda *_: asked.append("view"))
+    monkeypatch.setattr(train.jax, "process_index", lambda: process)
+    with pytest.raises(KeyboardInterrupt):
+        train.main([str(scene), "--output", str(tmp_path / "run"), "--view", "--tensorboard"])
+    assert asked == [["tensorboard", "view"], []][process]
+
+
 def test_an_interruption_before_the_first_step_is_one_word(scene, tmp_path, monkeypatch, capsys):
     def interrupt(*_):
         raise KeyboardInterrupt

@@ -146,3 +146,23 @@ def test_names_with_spaces_and_unicode(tmp_path):
     write_image(tmp_path / "a b.png", np.zeros((3, 4, 3)))
     (tmp_path / "a b.png").rename(tmp_path / "ein Bild é 日.png")
     assert images.read_image(tmp_path / "ein Bild é 日.png").shape == (3, 4, 3)
+
+
+def test_area_average_crops_and_averages():
+    image = np.random.default_rng(0).random((7, 8, 3), np.float32)
+    small = images.area_average(image, 3)
+    assert small.shape == (2, 2, 3)
+    np.testing.assert_allclose(small[1, 0], image[3:6, :3].mean((0, 1)), rtol=1e-6)
+
+
+@pytest.mark.parametrize("channels", [None, 3, 4])
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_images_of_any_depth_and_channels(tmp_path, dtype, channels):
+    shape = (5, 6) if channels is None else (5, 6, channels)
+    pixels = np.random.default_rng(0).integers(0, np.iinfo(dtype).max, shape, dtype, endpoint=True)
+    if channels == 4:
+        pixels[0, :, 3] = 0  # colour under alpha 0 must survive
+    write_image(tmp_path / "a.png", pixels)
+    expected = np.repeat(pixels[..., None], 3, -1) if channels is None else pixels[..., :3]
+    np.testing.assert_allclose(images.read_image(tmp_path / "a.png"), expected / np.iinfo(dtype).max, atol=1e-6)
+    assert images.read_header(tmp_path / "a.png") == ((6, 5), False, False)

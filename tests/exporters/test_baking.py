@@ -119,3 +119,14 @@ def test_a_background_is_left_to_the_viewer(run):
     assert drawn.alpha.min() < 0.9
     exact = bright.renderer().welllit(camera)
     assert jnp.abs(drawn.features + 0.64 * (1 - drawn.alpha[..., None]) - exact).mean() < 0.04
+
+
+@pytest.mark.parametrize(("decomposition", "expected"), [("retinex", 0.64), ("none", 0.8), ("curve", 0.8)])
+def test_the_background_is_the_well_lit_image_of_nothing(run, decomposition, expected):
+    model = dataclasses.replace(run.config.model, background=0.8, decomposition=decomposition)
+    bare = dataclasses.replace(run, config=dataclasses.replace(run.config, model=model))
+    assert baking.background(bare) == pytest.approx(expected)
+    nothing = run.state.scene._replace(alive=jnp.zeros_like(run.state.scene.alive))
+    empty = dataclasses.replace(bare, state=run.state._replace(scene=nothing))
+    welllit = empty.renderer().welllit(run.dataset.train.camera(0))
+    np.testing.assert_allclose(welllit, expected, rtol=1e-6)

@@ -306,7 +306,7 @@ def exploding(losses, below):
     return take
 
 
-@pytest.mark.parametrize(("below", "returns"), [(0.5, [(15, 0.5)]), (0.25, [(15, 0.5), (12, 0.25)])])
+@pytest.mark.parametrize(("below", "returns"), [(0.5, [(12, 0.5)]), (0.25, [(12, 0.5), (12, 0.25)])])
 def test_a_loss_that_explodes_is_put_back_before_it(dataset, tmp_path, monkeypatch, below, returns):
     monkeypatch.setattr(recorder, "LOG_EVERY", 1)
     losses = [1 / (1 + 0.1 * step) for step in range(LONG.steps)]

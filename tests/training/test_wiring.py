@@ -207,7 +207,7 @@ def test_every_rate_moves_its_parameters_and_no_others(dataset):
 def test_a_scene_has_no_rates_for_what_it_does_without(dataset):
     """So that its checkpoints are those of versions before there were any."""
     rates = initial_state(dataset, config_of(**{"model.motion_gate": False})).adam.schedules
-    assert rates.keys() == set(RATE_GROUPS) - {"gate", "paths", "lifetimes", "exposures"}
+    assert rates.keys() == set(RATE_GROUPS) - {"gate", "paths", "lifetimes", "exposures", "curves"}
 
 
 def test_weights_on_sizes_and_the_gate(dataset):
