@@ -19,6 +19,7 @@ from l2dgs_jax.errors import UserError
 from l2dgs_jax.runtime.prefetch import prefetch
 from l2dgs_jax.types import Camera
 
+OPPOSED = -0.3  # correlation of depth and points from which on one of them is upside down
 LINEAR_NOTE = "pictures of floating-point values are taken as linear light and converted to sRGB"
 
 # Decoding and resampling release the interpreter lock.
@@ -80,7 +81,8 @@ def assemble(
 
     Raises:
         UserError: a picture is missing, damaged, or of another size than its camera or the other pictures; or a camera
-            or point lies beyond what single precision can hold; or there is no room for the temporary files.
+            or point lies beyond what single precision can hold; or depth and points contradict each other; or there is
+            no room for the temporary files.
     """
     frames = [*train, *test]
     full = _common_size(frames)
@@ -93,6 +95,11 @@ def assemble(
     size = 6 * (1 + (folder / "well").is_dir()) + 4 * any((folder / kind).is_dir() for kind in depth_maps.FOLDERS)
     in_file = size * len(frames) * height * width > frame_memory * 2**30
     learned, train_notes = _SplitReader(folder, "train", train, width, height, downscale, in_file).read()
+    if learned.depths is not None and depth_maps.agreement(learned.depths, learned.cameras, points) < OPPOSED:
+        raise UserError(
+            f"{folder}: its depth falls where its points are farther away; expected distances in depth/, or their "
+            "inverses in disparity/"
+        )
     held_out, test_notes = _SplitReader(folder, "val", test, width, height, downscale, in_file).read()
     return Dataset(
         name=folder.resolve().name,

@@ -11,16 +11,19 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float, Float32
 
+from l2dgs_jax.cameras.geometry import project_points
 from l2dgs_jax.data.images import read_image
 from l2dgs_jax.data.parsing import read_array
 from l2dgs_jax.data.pictures import Picture, by_name, only, scales
 from l2dgs_jax.errors import UserError
+from l2dgs_jax.types import Camera
 
 FOLDERS = {"depth": False, "disparity": True}  # whether what they hold is inverse depth
 SUFFIXES = (".npy", ".png")
 LARGEST = 1e18  # squares must fit into single precision as well
+LOOKED_AT = 8  # frames that `agreement` samples
 
 
 def find(folder: Path, downscale: int, names: Sequence[str]) -> tuple[list[Picture | None], bool, list[str]]:
@@ -68,3 +71,22 @@ def read(path: Path, inverse: bool) -> Float32[np.ndarray, "h w"]:
     known = (values > 1 / LARGEST) & (values < LARGEST)
     values = np.where(known, values, 1)
     return np.where(known, values if inverse else 1 / values, 0).astype(np.float32)
+
+
+def agreement(depths: Float32[np.ndarray, "F H W"], cameras: Camera, points: Float[np.ndarray, "P 3"]) -> float:
+    """Correlation of depth with that of the points, logarithms of both, in the median of some frames.
+
+    0 where there is nothing to compare. It tells depth from inverse depth, which are easily mistaken for each other.
+    """
+    height, width = depths.shape[1:]
+    found = []
+    for frame in range(0, len(depths), -(-len(depths) // LOOKED_AT)):
+        depth = depths[frame]
+        pixels, distances = project_points(points, cameras.viewmat[frame], cameras.K[frame])  # type: ignore[arg-type]
+        inside = ((pixels >= 0) & (pixels < (width, height))).all(-1)
+        columns, rows = pixels[inside].astype(int).T
+        told = depth[rows, columns]
+        pairs = np.log(np.stack([told, distances[inside]])[:, told > 0])
+        if pairs.shape[1] > 1 and pairs.std(1).all():
+            found.append(np.corrcoef(pairs)[0, 1])
+    return float(np.median(found)) if found else 0.0

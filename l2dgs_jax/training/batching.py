@@ -36,7 +36,7 @@ def next_batch(split: Split, config: Config, step: int, flows: Flows | None) -> 
             for stack, own in zip(rows, (*view.camera, view.image, view.valid), strict=True):
                 stack[row] = own
             if batch.depths is not None:
-                batch.depths[row] = 0  # type: ignore[index]  # nobody knows it between frames
+                batch.depths[row] = 0  # nobody knows it between frames
     return batch._replace(valid=valid)  # type: ignore[arg-type]
 
 

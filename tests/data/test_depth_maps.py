@@ -1,9 +1,14 @@
+import shutil
+
 import cv2
 import numpy as np
 import pytest
 from scenes import write_nerfies
+from scipy.spatial import cKDTree
 
 from l2dgs_jax import data
+from l2dgs_jax.cameras.flow import pixel_indices
+from l2dgs_jax.cameras.geometry import project_points
 from l2dgs_jax.data.stacks import MappedArray
 from l2dgs_jax.errors import UserError
 
@@ -129,6 +134,25 @@ def test_a_malformed_file_is_one_sentence(scene, content, complaint):
     write_depth(scene, train_names(scene), change=lambda _: content)
     with pytest.raises(UserError, match=complaint):
         data.load_dataset(scene)
+
+
+def test_depth_in_place_of_disparity_is_refused(tmp_path):
+    """Points in view at distances that the maps know."""
+    scene = write_nerfies(tmp_path, num_points=400)
+    dataset = data.load_dataset(scene)
+    for kind, power in (("depth", 1), ("disparity", -1)):
+        for refused in (False, True):
+            (scene / kind / "1x").mkdir(parents=True)
+            for index, name in enumerate(dataset.train.names):
+                pixels, distances = project_points(dataset.points, *(x[index] for x in dataset.train.cameras[:2]))
+                _, nearest = cKDTree(pixels).query(pixel_indices(HEIGHT, WIDTH))
+                np.save(scene / kind / "1x" / f"{name}.npy", distances[nearest] ** (-power if refused else power))
+            if refused:
+                with pytest.raises(UserError, match=r"its depth falls where its points are farther away; expected"):
+                    data.load_dataset(scene)
+            else:
+                assert data.load_dataset(scene).train.depths.all()
+            shutil.rmtree(scene / kind)
 
 
 def test_depth_lies_in_files_where_frames_do_and_counts_in_the_budget(scene):
