@@ -11,6 +11,8 @@ from l2dgs_jax.cameras.flow import pixel_indices
 from l2dgs_jax.cameras.geometry import project_points
 from l2dgs_jax.data.stacks import MappedArray
 from l2dgs_jax.errors import UserError
+from l2dgs_jax.preprocess.enhancement import enhanced
+from l2dgs_jax.preprocess.lowlight import DarkeningConfig, darken
 
 HEIGHT, WIDTH = 24, 32
 
@@ -172,6 +174,15 @@ def test_every_layout_keeps_depth(scene, tmp_path, layout):
     assert copy.train.names == dataset.train.names
     assert copy.test.depths is None
     np.testing.assert_allclose(copy.train.depths, dataset.train.depths, rtol=1e-6)
+
+
+def test_depth_stays_with_frames_made_brighter_or_darker(scene):
+    dataset = data.load_dataset(write_depth(scene, train_names(scene)))
+    bright = enhanced(dataset, "gamma")
+    dark, _ = darken(bright, DarkeningConfig(method="analytic", exposure=0.05))
+    for other in (bright, dark):
+        assert not np.array_equal(other.train.images, dataset.train.images)
+        np.testing.assert_array_equal(other.train.depths, dataset.train.depths)
 
 
 def test_depth_stays_with_its_frame_whichever_are_held_out(scene):

@@ -246,18 +246,20 @@ def test_depth_of_the_scene_counts_by_its_weight(dataset):
     given = batch_of(dataclasses.replace(dataset.train, depths=distances), [0, 3])
     probe = jnp.zeros((2, len(state.scene.alive), 2))
 
-    @partial(jax.jit, static_argnums=1)
-    def loss(batch, weight):
-        own = overrides.replace(config, {"loss.depth_input": weight})
-        value, (report, _) = step.objective(state.scene.params, probe, state, batch, own, True, 4096)
-        return value, report.terms
+    @jax.jit
+    def losses():
+        def loss(batch, weight):
+            own = overrides.replace(config, {"loss.depth_input": weight})
+            value, (report, _) = step.objective(state.scene.params, probe, state, batch, own, False, 4096)
+            return value, report.terms
 
-    plain, terms = loss(given, 0.0)
-    assert "depth_input" not in terms
-    assert loss(batch, 3.0)[0] == loss(batch, 0.0)[0] == plain
-    weighted, terms = loss(given, 3.0)
-    assert terms["depth_input"] > 0.01
-    np.testing.assert_allclose(weighted - plain, 3 * terms["depth_input"], rtol=1e-9)
+        return loss(batch, 3.0), loss(given, 0.0), loss(given, 3.0)
+
+    (without, _), (unused, terms), (used, more) = losses()
+    assert without == unused
+    assert more.keys() - terms.keys() == {"depth_input"}
+    assert more["depth_input"] > 0.001
+    np.testing.assert_allclose(used - unused, 3 * more["depth_input"], rtol=1e-9)
 
 
 def test_bands_by_the_length_of_the_run(dataset):
