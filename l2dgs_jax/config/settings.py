@@ -156,6 +156,7 @@ class LossConfig:
     depth: Number = 0.001  # lambda_5, Eq. 12
     depth_gradient: Literal["forward", "sobel"] = "forward"  # differences in Eq. 12
     depth_gain: Number = 1.0  # factor on D inside Eq. 12
+    depth_input: Number = 0.0  # difference from the scene's own depth, if it has any (training/given_depth.py)
     illumination_tv: Number = 0.0  # mean |forward difference| of L_w
     exponent_prior: Number = 0.0  # mean |B1 - initial B1|
     plane_smoothness: Number = 2e-4  # second differences along the space planes' first axis, fine stage only

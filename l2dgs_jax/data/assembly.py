@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Bool, Float, Float16, Float32, UInt8
 
-from l2dgs_jax.data import images
+from l2dgs_jax.data import depth_maps, images
 from l2dgs_jax.data.dataset import Dataset, Original, Split
 from l2dgs_jax.data.lens import Lens, scale_intrinsics, seen, undistort, without_skew
 from l2dgs_jax.data.pictures import Picture, stored_if_any
@@ -19,6 +19,7 @@ from l2dgs_jax.errors import UserError
 from l2dgs_jax.runtime.prefetch import prefetch
 from l2dgs_jax.types import Camera
 
+OPPOSED = -0.3  # correlation of depth and points from which on one of them is upside down
 LINEAR_NOTE = "pictures of floating-point values are taken as linear light and converted to sRGB"
 
 # Decoding and resampling release the interpreter lock.
@@ -66,7 +67,7 @@ def assemble(
     """Read the pictures of the frames, undistorted and `downscale` times smaller than the cameras' full size.
 
     Whatever the layout, `well/<k>x/<name>.png`, `mask/<k>x/<name>.png` and `covisible/<k>x/{train,val}/<name>.png` in
-    the scene's folder are the frames' truth and masks.
+    the scene's folder are the frames' truth and masks, and `depth/` or `disparity/` (depth_maps.py) is their depth.
 
     Args:
         folder: of the scene.
@@ -75,12 +76,13 @@ def assemble(
         points: surface points, world units.
         colors: of the points, in [0, 1].
         downscale: every picture's own scale divides it.
-        frame_memory: GiB that pictures and truth may take together; if they take more they lie in temporary files.
+        frame_memory: GiB that pictures, truth and depth may take together; beyond it they lie in temporary files.
         notes: what the reader assumed.
 
     Raises:
         UserError: a picture is missing, damaged, or of another size than its camera or the other pictures; or a camera
-            or point lies beyond what single precision can hold; or there is no room for the temporary files.
+            or point lies beyond what single precision can hold; or depth and points contradict each other; or there is
+            no room for the temporary files.
     """
     frames = [*train, *test]
     full = _common_size(frames)
@@ -89,9 +91,15 @@ def assemble(
     if _check_pictures([frame.image for frame in frames], full):
         notes = (*notes, LINEAR_NOTE)
     width, height = full[0] // downscale, full[1] // downscale
-    kinds = 1 + (folder / "well").is_dir()  # masks take a sixth of what pictures take
-    in_file = kinds * len(frames) * height * width * 3 * np.dtype(np.float16).itemsize > frame_memory * 2**30
+    # Of a pixel; masks take a sixth of what pictures take.
+    size = 6 * (1 + (folder / "well").is_dir()) + 4 * any((folder / kind).is_dir() for kind in depth_maps.FOLDERS)
+    in_file = size * len(frames) * height * width > frame_memory * 2**30
     learned, train_notes = _SplitReader(folder, "train", train, width, height, downscale, in_file).read()
+    if learned.depths is not None and depth_maps.agreement(learned.depths, learned.cameras, points) < OPPOSED:
+        raise UserError(
+            f"{folder}: its depth falls where its points are farther away; expected distances in depth/, or their "
+            "inverses in disparity/"
+        )
     held_out, test_notes = _SplitReader(folder, "val", test, width, height, downscale, in_file).read()
     return Dataset(
         name=folder.resolve().name,
@@ -119,14 +127,17 @@ def _check_pictures(pictures: Sequence[Picture], full: tuple[int, int]) -> bool:
     """Compare every picture's header with the cameras' full size; whether any picture holds linear light."""
     headers = list(_parallel(lambda picture: images.read_header(picture.path), pictures))
     for picture, header in zip(pictures, headers, strict=True):
-        exact = (full[0] / picture.scale, full[1] / picture.scale)
-        if any(abs(actual - wanted) >= 1 for actual, wanted in zip(header.size, exact, strict=True)):
-            turned = " once turned as its EXIF orientation says" if header.turned else ""
-            raise UserError(
-                f"{picture.path}: the picture is {_by(header.size)}{turned}; expected "
-                f"{_by((round(exact[0]), round(exact[1])))} as the cameras say"
-            )
+        _check_size(picture, header.size, full, " once turned as its EXIF orientation says" if header.turned else "")
     return any(header.linear for header in headers)
+
+
+def _check_size(picture: Picture, size: tuple[int, int], full: tuple[int, int], why: str = "") -> None:
+    exact = (full[0] / picture.scale, full[1] / picture.scale)
+    if any(abs(actual - wanted) >= 1 for actual, wanted in zip(size, exact, strict=True)):
+        raise UserError(
+            f"{picture.path}: the picture is {_by(size)}{why}; expected "
+            f"{_by((round(exact[0]), round(exact[1])))} as the cameras say"
+        )
 
 
 @dataclass(frozen=True)
@@ -152,11 +163,12 @@ class _SplitReader:
     in_file: bool
 
     def read(self) -> tuple[Split, list[str]]:
-        """The split, with notes; truth and masks that no frame has are None."""
+        """The split, with notes; truth, masks and depth that no frame has are None."""
         lowlight, valid = self._lowlight()
         welllit, well_note = self._truth("well", as_mask=False)
         masks, mask_note = self._truth("mask", as_mask=True)
         covisible, covisible_note = self._truth("covisible", as_mask=True, prefix=f"{self.part}/")
+        depths, depth_notes = self._depths()
         K = [scale_intrinsics(without_skew(frame.K), self.downscale) for frame in self.frames]
         split = Split(
             names=tuple(frame.name for frame in self.frames),
@@ -170,9 +182,11 @@ class _SplitReader:
             masks=masks,
             valid=valid,
             covisible=covisible,
+            depths=depths,
             originals=tuple(Original(frame.size, frame.K, frame.lens) for frame in self.frames),
         )
-        return split, [note for note in (well_note, mask_note, covisible_note) if note]
+        notes = [note for note in (well_note, mask_note, covisible_note) if note]
+        return split, notes + depth_notes if self.part == "train" else notes  # depth is only learned from
 
     def _lowlight(self) -> tuple[Float16[np.ndarray, "F H W 3"], Bool[np.ndarray, "F H W"] | None]:
         """The low-light images, and which of their pixels count; None if all do."""
@@ -225,6 +239,27 @@ class _SplitReader:
 
         read_all = _parallel(read_one, range(len(self.frames)))
         return self._stack(read_all, bool) if as_mask else self._stack(read_all, np.float16, 3), note
+
+    def _depths(self) -> tuple[Float32[np.ndarray, "F H W"] | None, list[str]]:
+        """Depth of the frames, 0 where unknown, and notes."""
+        found, inverse, notes = depth_maps.find(self.folder, self.downscale, [frame.name for frame in self.frames])
+        if not found:
+            return None, notes
+        read_all = _parallel(lambda index: self._depth(self.frames[index], found[index], inverse), range(len(found)))
+        return self._stack(read_all, np.float32), notes
+
+    def _depth(self, frame: Frame, file: Picture | None, inverse: bool) -> Float32[np.ndarray, "H W"]:
+        """Depth of a frame: the inverse of the mean inverse depth of the samples that a pixel is made from."""
+        if file is None:
+            return np.zeros((self.height, self.width), np.float32)
+        disparity = depth_maps.read(file.path, inverse)
+        size = (disparity.shape[1], disparity.shape[0])
+        _check_size(file, size, frame.size)
+        K = scale_intrinsics(frame.K, file.scale)
+        straight, inside = undistort(disparity[..., None], K, frame.lens, nearest=True), seen(size, K, frame.lens)
+        known = straight > 0 if inside is None else (straight > 0) & inside[..., None]
+        total, share = np.moveaxis(self._shrink(np.dstack([straight * known, known]), file.scale), -1, 0)
+        return np.divide(share, total, out=np.zeros_like(share), where=share > 0)
 
     def _fit(self, frame: Frame, image: Float32[np.ndarray, "h w C"], scale: int) -> Float32[np.ndarray, "H W C"]:
         """A picture that is already `scale` times smaller, undistorted, at the size wanted."""

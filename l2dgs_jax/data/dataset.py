@@ -5,7 +5,7 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Float32
 
 from l2dgs_jax.cameras.geometry import select_camera
 from l2dgs_jax.data.lens import Lens
@@ -54,7 +54,7 @@ class Original(NamedTuple):
 
 @dataclass(frozen=True)
 class Split:
-    """Frames of a scene as NumPy arrays; images, truth and masks beyond a budget of memory are `MappedArray`s.
+    """Frames of a scene as NumPy arrays; images, truth, masks and depths beyond a budget of memory are `MappedArray`s.
 
     Attributes:
         names: of the frames.
@@ -64,6 +64,8 @@ class Split:
         masks: True where something moves, if the scene has them.
         valid: False where a picture shows nothing to learn from or to be scored on; None where all pixels do.
         covisible: True where enough training views see the same place, if the scene says so (arXiv 2210.13445).
+        depths: along the optical axis, 0 where unknown, if the scene has them. Only differences of inverse depth within
+            a frame count, and these only up to a factor: where a network guessed them, no more is known.
         originals: what lies on disk at full size, for those who write pictures that belong to it.
     """
 
@@ -74,6 +76,7 @@ class Split:
     masks: Bool[np.ndarray, "F H W"] | None = None
     valid: Bool[np.ndarray, "F H W"] | None = None
     covisible: Bool[np.ndarray, "F H W"] | None = None
+    depths: Float32[np.ndarray, "F H W"] | None = None
     originals: tuple[Original, ...] = ()
 
     @cached_property

@@ -51,7 +51,7 @@ def distort(
 
 
 def undistort(
-    image: Float32[np.ndarray, "H W C"], K: Float[np.ndarray, "3 3"], lens: Lens
+    image: Float32[np.ndarray, "H W C"], K: Float[np.ndarray, "3 3"], lens: Lens, nearest: bool = False
 ) -> Float32[np.ndarray, "H W C"]:
     """The picture that the pinhole camera `without_skew(K)` would have taken.
 
@@ -61,10 +61,13 @@ def undistort(
         image: as taken through the lens.
         K: intrinsics of `image`, skew included.
         lens: its distortion.
+        nearest: take the value of the nearest pixel, for what must not be mixed; otherwise values are in [0, 1].
     """
     if lens.is_pinhole and K[0, 1] == 0:
         return image
     columns, rows = _positions(image.shape[1], image.shape[0], tuple(K[:2].ravel().tolist()), lens)
+    if nearest:  # the same pixel as that of the position before it was bent for cubic interpolation
+        return cv2.remap(image, columns, rows, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE).reshape(image.shape)
     warped = cv2.remap(image, columns, rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     return np.clip(warped.reshape(image.shape), 0, 1)  # cubic interpolation overshoots
 

@@ -4,7 +4,7 @@
     points.npy   [points_rgb.npy]
 
 Instead of the lists in `dataset.json` there may be `splits/{train,val}.json`. The alpha of DyCheck's pictures says
-which pixels are valid; its depth is not read.
+which pixels are valid.
 """
 
 from pathlib import Path

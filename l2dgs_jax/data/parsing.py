@@ -31,8 +31,8 @@ def read_json(path: Path, what: str) -> dict[str, Any]:
     return content
 
 
-def read_array(path: Path, what: str) -> np.ndarray:
-    """The finite real numbers in an .npy file; `what` says what they should be.
+def read_array(path: Path, what: str, finite: bool = True) -> np.ndarray:
+    """The real numbers in an .npy file, all `finite` unless said otherwise; `what` says what they should be.
 
     Raises:
         UserError: the file is missing, damaged, or holds something else.
@@ -48,7 +48,7 @@ def read_array(path: Path, what: str) -> np.ndarray:
         raise UserError(f"{path}: not a NumPy array of numbers ({reason}); expected {what}") from None
     if not isinstance(values, np.ndarray) or values.dtype.kind not in "iuf":
         raise UserError(f"{path}: not a NumPy array of numbers; expected {what}")
-    if not np.isfinite(values).all():
+    if finite and not np.isfinite(values).all():
         raise UserError(f"{path}: holds NaN or infinite values; expected finite numbers")
     return values
 

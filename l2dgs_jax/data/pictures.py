@@ -29,7 +29,7 @@ def stored(root: Path, downscale: int, names: Sequence[str]) -> list[Picture]:
     missing = [name for name in names if name not in files]
     if missing:
         raise UserError(f"{folder / missing[0]}.png: no such file; expected the picture of frame '{missing[0]}'")
-    return [Picture(_only(files[name]), scale) for name in names]
+    return [Picture(only(files[name]), scale) for name in names]
 
 
 def stored_if_any(root: Path, downscale: int, names: Sequence[str], all_or_none: bool) -> tuple[list[Picture], str]:
@@ -46,7 +46,7 @@ def stored_if_any(root: Path, downscale: int, names: Sequence[str], all_or_none:
     """
     if not root.is_dir():
         return [], ""
-    held, scale = _scales(root, downscale)
+    held, scale = scales(root, downscale)
     if not scale:
         return [], f"{root.name}/ holds {held}: not used at --downscale {downscale}"
     has = by_name(root / f"{scale}x").keys() & set(names)
@@ -82,37 +82,37 @@ def copies(scene: Path, root: Path, downscale: int, files: Mapping[str, str]) ->
             f"{folder}: holds {len(found)} pictures, but none of {len(missing)} of the {len(files)} frames, such as "
             f"'{missing[0]}'; expected every frame's"
         )
-    return [Picture(_only(found[name], folder / file), scale) for name, file in files.items()]
+    return [Picture(only(found[name], folder / file), scale) for name, file in files.items()]
 
 
-def by_name(folder: Path) -> dict[str, list[Path]]:
-    """Picture files by their path within the folder, without the suffix."""
+def by_name(folder: Path, suffixes: Sequence[str] = SUFFIXES) -> dict[str, list[Path]]:
+    """Files of pictures, or of other `suffixes`, by their path within the folder, without the suffix."""
     files: dict[str, list[Path]] = {}
     for path in sorted(folder.rglob("*")):
-        if path.suffix.lower() in SUFFIXES:
+        if path.suffix.lower() in suffixes:
             files.setdefault(path.relative_to(folder).with_suffix("").as_posix(), []).append(path)
     return files
 
 
-def _only(files: Sequence[Path], meant: Path | None = None) -> Path:
+def only(files: Sequence[Path], meant: Path | None = None) -> Path:
     """The one of several pictures of a name that is meant, or the only one."""
     if meant and meant in files:
         return meant
     if len(files) > 1:
-        raise UserError(f"{files[0]}: is {files[1].name} under another suffix; expected one picture for each frame")
+        raise UserError(f"{files[0]}: is {files[1].name} under another suffix; expected one file for each frame")
     return files[0]
 
 
 def _coarsest(root: Path, downscale: int) -> tuple[Path, int]:
     if not root.is_dir():
         raise UserError(f"{root}: no such folder; expected pictures in {root / '1x'}")
-    held, scale = _scales(root, downscale)
+    held, scale = scales(root, downscale)
     if not scale:
         raise UserError(f"{root}: holds {held}; expected a factor that divides --downscale {downscale}")
     return root / f"{scale}x", scale
 
 
-def _scales(root: Path, downscale: int) -> tuple[str, int]:
+def scales(root: Path, downscale: int) -> tuple[str, int]:
     """The factors k of the folders `<k>x`, in words, and the largest of them that divides `downscale`, else 0."""
     held = sorted(int(match[1]) for path in root.iterdir() if (match := _SCALE.fullmatch(path.name)))
     largest = max((factor for factor in held if downscale % factor == 0), default=0)

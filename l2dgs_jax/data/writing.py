@@ -1,4 +1,4 @@
-"""What the writers of all layouts share: pictures, truth and masks, lists of frames and instants."""
+"""What the writers of all layouts share: pictures, truth, masks and depth, lists of frames and instants."""
 
 from pathlib import Path
 from typing import Any
@@ -37,6 +37,10 @@ def write_pictures(dataset: Dataset, root: Path, folder: Path) -> None:
             for kind, values in kinds:
                 if values is not None:
                     _write(kind / f"{name}.png", to_bytes(values[i]))
+            if split.depths is not None:
+                path = folder / "depth" / "1x" / f"{name}.npy"
+                path.parent.mkdir(parents=True, exist_ok=True)
+                np.save(path, split.depths[i])
 
 
 def write_lists(dataset: Dataset, folder: Path) -> None:

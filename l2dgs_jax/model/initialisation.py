@@ -200,6 +200,9 @@ def _initialise(
         lifetimes=lifetimes,
         color_rest=jnp.zeros((count, 3, num_rest)) if cfg.decomposition != "retinex" else None,
     )
+    curves = None
+    if cfg.decomposition == "curve" and curve is not None:
+        curves = ToneCurves(curve, jnp.zeros((num_frames, RAMPS)))
     params = SceneParams(
         gaussians=jax.tree.map(lambda rows: pad_rows(rows, capacity), gaussians),
         hexplane=hexplane.init(keys[2], cfg, num_frames),
@@ -207,7 +210,7 @@ def _initialise(
         ocd=networks.init_ocd(keys[4], cfg),
         bafe=networks.init_bafe(keys[5], exponent_bias),
         exposures=exposures if cfg.exposure == "drifting" else None,
-        curves=ToneCurves(curve, jnp.zeros((num_frames, RAMPS))) if cfg.decomposition == "curve" else None,
+        curves=curves,
     )
     return Scene(
         params=params,

@@ -53,6 +53,7 @@ def _shapes(trial: Trial) -> dict[str, object]:
         "image size": f"{dataset.width}x{dataset.height}",
         "number of training frames": len(dataset.train.names) if config.model.time_size is None else None,
         "having pixels that do not count": dataset.train.valid is not None,
+        "having depth": dataset.train.depths is not None,
     }
 
 

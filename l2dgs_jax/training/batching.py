@@ -35,14 +35,19 @@ def next_batch(split: Split, config: Config, step: int, flows: Flows | None) -> 
             view = draw(split, flows, frame, float(parts[row]))
             for stack, own in zip(rows, (*view.camera, view.image, view.valid), strict=True):
                 stack[row] = own
+            if batch.depths is not None:
+                batch.depths[row] = 0  # nobody knows it between frames
     return batch._replace(valid=valid)  # type: ignore[arg-type]
 
 
 def load_batch(split: Split, indices: Int[np.ndarray, " V"]) -> Batch:
     """The frames of `indices`."""
     valid = None if split.valid is None else split.valid[indices]
+    depths = None if split.depths is None else split.depths[indices]
+    if depths is not None and valid is not None:
+        depths[~valid] = 0
     cameras = Camera(*(x[indices] for x in split.cameras))
-    return Batch(cameras, split.images[indices], np.asarray(indices, np.int32), valid)  # type: ignore[arg-type]
+    return Batch(cameras, split.images[indices], np.asarray(indices, np.int32), valid, depths)  # type: ignore[arg-type]
 
 
 def view_indices(seed: int, step: int, batch_size: int, num_frames: int) -> Int[np.ndarray, " B"]:

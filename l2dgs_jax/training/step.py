@@ -15,6 +15,7 @@ from l2dgs_jax.model.initialisation import pad_rows
 from l2dgs_jax.model.rendering import render
 from l2dgs_jax.training import densification, losses, optimizer, relocation
 from l2dgs_jax.training.densification import GrowthStats
+from l2dgs_jax.training.given_depth import depth_disagreement
 from l2dgs_jax.training.parameter_groups import groups, schedules
 from l2dgs_jax.types import Camera, Gaussians, Scene, SceneParams, ToneCurves
 
@@ -29,12 +30,14 @@ class Batch(NamedTuple):
         images: sRGB in [0, 1].
         frames: which of the training frames they are.
         valid: where there is something to learn; None for everywhere.
+        depths: as in `Split`, 0 where unknown or not to be learned; None if the scene has none.
     """
 
     cameras: Camera
     images: Float[Array, "*S V H W 3"]
     frames: Int[Array, "*S V"]
     valid: Bool[Array, "*S V H W"] | None = None
+    depths: Float[Array, "*S V H W"] | None = None
 
 
 class TrainState(NamedTuple):
@@ -88,7 +91,7 @@ def objective(
     pair_capacity: int,
     axis: str | None = None,
 ) -> tuple[Float[Array, ""], tuple[StepReport, Float[Array, "V N"]]]:
-    """Eq. 15 plus the plane regularisers of 4DGS (arXiv 2310.08528), for one batch.
+    """Eq. 15 plus the plane regularisers of 4DGS (arXiv 2310.08528) and what `LossConfig` adds, for one batch.
 
     Gradients flow to `params` and to `probe`, zeros added to the projected centres. The loss is that of the views at
     hand: with views spread over the devices of `axis`, its mean over them is the loss of all views.
@@ -135,6 +138,9 @@ def objective(
         smoothness, time_smoothness, time_l1 = hexplane.regularisers(params.hexplane)
         loss += cfg.plane_smoothness * smoothness + cfg.time_smoothness * time_smoothness + cfg.time_l1 * time_l1
     others = size_terms(state.scene._replace(params=params), config, moving) | curve_terms(params.curves, batch, cfg)
+    if batch.depths is not None:
+        depths = batch.depths
+        others["depth_input"] = (cfg.depth_input, lambda: depth_disagreement(output.depth, output.alpha, depths))
     other, values = losses.weighted_sum(others)
     loss, terms = loss + other, terms | values
     squares = jnp.mean(jnp.square(jax.lax.stop_gradient(images.lowlight) - target))

@@ -128,6 +128,8 @@ def scenes(tmp_path_factory):
         write_nerfies(folder / name, 8, 24, 18, num_points=20 + 5 * seed, seed=seed)
     write_nerfies(folder / "wide", 8, 30, 18, num_points=20)
     write_nerfies(folder / "long", 12, 24, 18, num_points=20)
+    (write_nerfies(folder / "deep", 8, 24, 18, num_points=20) / "depth" / "1x").mkdir(parents=True)
+    np.save(folder / "deep" / "depth" / "1x" / "000000.npy", np.ones((18, 24)))
     return folder
 
 
@@ -155,6 +157,7 @@ def test_members_that_brighten_their_frames_have_frames_of_their_own(scenes):
     [
         ('scenes = ["a", "wide"]', ["image size is 24x18 and 30x18", "wide"]),
         ('scenes = ["a", "long"]', ["number of training frames is 6 and 9"]),
+        ('scenes = ["a", "deep"]', ["having depth is False and True"]),
         ('scenes = ["a"]\n[grid]\nmodel.hidden = [8, 16]', ["model.hidden is 8 and 16"]),
         ('scenes = ["a", "nonsuch"]', ["nonsuch", "no such folder"]),
     ],

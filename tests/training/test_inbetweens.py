@@ -69,6 +69,22 @@ def test_a_view_between_two_frames_shows_what_is_there(split, flows, part):
     np.testing.assert_allclose(view.camera.viewmat[0, 3], -0.1 * (1 + part), rtol=1e-5)
 
 
+def test_depth_is_learned_at_frames_and_where_they_are_valid_only(split, flows):
+    depths = np.full(split.images.shape[:-1], 2.0, np.float32)
+    valid = np.ones(depths.shape, bool)
+    valid[:, :5] = False
+    known = dataclasses.replace(split, depths=depths, valid=valid)
+    config = tiny(inbetweens=0.5, batch_size=4)
+    times, drawn = set(split.cameras.time.tolist()), 0
+    for number in range(4):
+        batch = next_batch(known, config, number, flows)
+        for time, depth in zip(batch.cameras.time.tolist(), batch.depths, strict=True):
+            drawn += time not in times
+            np.testing.assert_array_equal(depth, np.where(valid[0], 2.0 * (time in times), 0))
+    assert 0 < drawn < 16
+    assert (depths == 2).all()
+
+
 def test_what_only_one_frame_shows_is_left_out(split):
     images = split.images.copy()
     images[3][PATCH] = 0.4

@@ -239,6 +239,29 @@ def test_weights_on_sizes_and_the_gate(dataset):
             np.testing.assert_allclose(added, expected, rtol=1e-6, atol=1e-12, err_msg=name)
 
 
+def test_depth_of_the_scene_counts_by_its_weight(dataset):
+    config = config_of(**{"loss.depth_input": 0.0})
+    distances = np.random.default_rng(0).uniform(1, 3, dataset.train.images.shape[:-1]).astype(np.float32)
+    state, batch = initial_state(dataset, config), batch_of(dataset.train, [0, 3])
+    given = batch_of(dataclasses.replace(dataset.train, depths=distances), [0, 3])
+    probe = jnp.zeros((2, len(state.scene.alive), 2))
+
+    @jax.jit
+    def losses():
+        def loss(batch, weight):
+            own = overrides.replace(config, {"loss.depth_input": weight})
+            value, (report, _) = step.objective(state.scene.params, probe, state, batch, own, False, 4096)
+            return value, report.terms
+
+        return loss(batch, 3.0), loss(given, 0.0), loss(given, 3.0)
+
+    (without, _), (unused, terms), (used, more) = losses()
+    assert without == unused
+    assert more.keys() - terms.keys() == {"depth_input"}
+    assert more["depth_input"] > 0.001
+    np.testing.assert_allclose(used - unused, 3 * more["depth_input"], rtol=1e-9)
+
+
 def test_bands_by_the_length_of_the_run(dataset):
     config = dataclasses.replace(config_of(), coarse_steps=40, fine_steps=80, sh_warmup=None)
     config = dataclasses.replace(config, model=dataclasses.replace(config.model, sh_degree=3))

@@ -1,0 +1,98 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from jax.test_util import check_grads
+from scipy.optimize import minimize
+
+from l2dgs_jax.training import given_depth
+from l2dgs_jax.training.given_depth import TOLERANCE, depth_disagreement
+
+V, H, W = 2, 6, 8
+disagreement = jax.jit(depth_disagreement)
+
+
+def views(seed=0, noise=0.2):
+    """Rendered depth and alpha, and depth that differs from it by more than scale and shift, with gaps in both."""
+    rng = np.random.default_rng(seed)
+    alpha = rng.uniform(0.6, 1, (V, H, W))
+    distance = rng.uniform(1, 4, (V, H, W))
+    told = 0.3 + 2 / distance * (1 + noise * rng.normal(size=distance.shape))
+    alpha[0, 0, :3] = 0.2
+    told[:, 2, 3:5] = 0
+    given = np.divide(1, told, out=np.zeros_like(told), where=told > 0)
+    return jnp.asarray(alpha * distance), jnp.asarray(alpha), jnp.asarray(given)
+
+
+def expected(depth, alpha, given):
+    """The least mean over lines, found by another solver."""
+    total = 0.0
+    for d, a, g in zip(*map(np.asarray, (depth, alpha, given)), strict=True):
+        known = (g > 0) & (a > 0.5)
+        y, x = a[known] / d[known], 1 / g[known]
+        y, x = y / y.mean(), x / x.mean()
+
+        def cost(line, x=x, y=y):
+            return TOLERANCE * (np.sqrt(1 + ((y - abs(line[0]) * x - line[1]) / TOLERANCE) ** 2) - 1).sum()
+
+        total += minimize(cost, (1, 0), method="Nelder-Mead", options={"xatol": 1e-9, "fatol": 1e-12}).fun
+    return total / np.size(depth)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_it_is_the_least_mean_difference_over_scales_and_shifts(seed):
+    arrays = views(seed)
+    np.testing.assert_allclose(disagreement(*arrays), expected(*arrays), rtol=1e-4)
+
+
+@settings(deadline=None, max_examples=30)
+@given(scale=st.floats(0.01, 100), shift=st.floats(0, 3), unit=st.floats(0.01, 100))
+def test_scale_shift_and_unit_do_not_count(scale, shift, unit):
+    depth, alpha, told = views()
+    other = jnp.where(told > 0, 1 / (scale * (1 / jnp.where(told > 0, told, 1) + shift)), 0)
+    np.testing.assert_allclose(disagreement(unit * depth, alpha, other), disagreement(depth, alpha, told), rtol=1e-6)
+
+
+def test_what_agrees_costs_nothing_and_opacity_is_not_depth():
+    depth, alpha, _ = views()
+    distance = depth / alpha
+    np.testing.assert_allclose(disagreement(depth, alpha, distance), 0, atol=1e-12)
+    fainter = 0.8 * alpha.at[0, 0, :3].set(1)
+    np.testing.assert_allclose(disagreement(fainter * distance, fainter, distance), 0, atol=1e-12)
+    assert disagreement(depth, alpha, 5 - distance) > 0.1  # near is far
+
+
+def test_gradients(monkeypatch):
+    """They are those of the least mean; the search comes as close to it as its rounds allow."""
+    depth, alpha, told = views()
+    near = jax.grad(depth_disagreement, (0, 1))(depth, alpha, told)
+    monkeypatch.setattr(given_depth, "ROUNDS", 1000)
+    function = jax.jit(lambda depth, alpha: depth_disagreement(depth, alpha, told))
+    check_grads(function, (depth, alpha), order=1, modes=("rev",), eps=1e-6, atol=1e-7, rtol=1e-5)
+    for x, y in zip(near, jax.grad(function, (0, 1))(depth, alpha), strict=True):
+        assert np.linalg.norm(x - y) < 0.05 * np.linalg.norm(y)
+
+
+@pytest.mark.parametrize("level", [0.0, 1e-6, 1.0])
+@pytest.mark.parametrize("told", ["nothing", "one pixel", "the same everywhere", "extremes"])
+def test_what_tells_nothing_is_finite_in_single_precision(level, told):
+    given = {
+        "nothing": np.zeros((V, H, W)),
+        "one pixel": np.eye(H, W)[None].repeat(V, 0) * (np.arange(H) == 2)[:, None],
+        "the same everywhere": np.full((V, H, W), 3.0),
+        "extremes": np.where(np.arange(W) % 2, 1e-18, 1e18) * np.ones((V, H, 1)),
+    }[told]
+    depth, alpha = np.full((V, H, W), level), np.full((V, H, W), level > 0)
+    depth, alpha, given = (jnp.asarray(x, jnp.float32) for x in (depth, alpha, given))
+    value, slopes = jax.jit(jax.value_and_grad(depth_disagreement, (0, 1)))(depth, alpha, given)
+    assert value.dtype == jnp.float32
+    assert all(jnp.isfinite(x).all() for x in (value, *slopes))
+    assert value < 1e-6
+
+
+def test_the_total_is_the_mean_over_views():
+    arrays = views()
+    each = [disagreement(*(x[v : v + 1] for x in arrays)) for v in range(V)]
+    np.testing.assert_allclose(disagreement(*arrays), np.mean(each), rtol=1e-9)
