@@ -79,6 +79,7 @@ def _presets() -> dict[str, Config]:
             illumination_lr=1e-3,
             reflectance_lr=5e-3,  # 1e-5 moves a reflectance by 0.03 in 3,000 steps
             attenuation_lr=5e-3,
+            scales_lr=0.012,  # 3DGS's rate is for 25 times as many steps
             heads_lr=1.5e-3,
             planes_lr=1.6e-2,
             ocd_lr=5e-5,
@@ -92,7 +93,7 @@ def _presets() -> dict[str, Config]:
         default,
         fine_steps=4900,
         model=dataclasses.replace(default.model, hidden=128, plane_scales=(1, 2, 4)),
-        optim=dataclasses.replace(default.optim, decay_steps=7500),
+        optim=dataclasses.replace(default.optim, scales_lr=5e-3, decay_steps=7500),
         density=dataclasses.replace(default.density, stop=3000),
     )
     # A smaller motion field and fewer steps, in which nothing is added.
@@ -102,7 +103,7 @@ def _presets() -> dict[str, Config]:
         fine_steps=250,
         sh_warmup=150,
         model=dataclasses.replace(default.model, plane_size=32, hidden=32),
-        optim=dataclasses.replace(default.optim, decay_steps=None),
+        optim=dataclasses.replace(default.optim, scales_lr=0.04, quats_lr=4e-3, decay_steps=None),
         density=dataclasses.replace(default.density, stop=0),
     )
     # 4DGS (arXiv 2310.08528): its model, objective, rates and schedule; steps and growth of `default`.
