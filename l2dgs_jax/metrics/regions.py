@@ -42,14 +42,14 @@ def compare(
 
     Returns:
         The scores of "overall", given `dynamic` of "dynamic" and "static", and given `covisible` of "covisible", always
-        "masked", those of them that have any pixel. None is a score that cannot be had of so few pixels, NaN any of a
-        frame whose counted pixels are not all finite; "area" is the region's part of the frame.
+        "masked", those of them that have any pixel. None is a score that cannot be had of so few pixels, NaN one that
+        values which are not finite have spoiled; "area" is the region's part of the frame.
     """
     prediction, truth = np.asarray(prediction), np.asarray(truth, prediction.dtype)
     masks = region_masks(prediction.shape[:2], dynamic, valid, covisible)
     truth = np.where(masks["overall"][..., None], truth, prediction)
     finite = np.isfinite((prediction - truth)[masks["overall"]]).all()
-    whole = {name: measure.maps(prediction, truth) for name, measure in measures.items()} if finite else {}
+    whole = {name: measure.maps(prediction, truth) for name, measure in measures.items()}
 
     def score(name: str, region: str) -> float:
         measure, mask = measures[name], masks[region]
@@ -59,9 +59,12 @@ def compare(
         alone = convention == "masked" if of_motion else not (region == "overall" and mask.all())
         return _score_alone(measure, prediction, truth, mask) if alone else mean_score(whole[name], measure, mask)
 
+    def told(name: str, region: str) -> float | None:
+        found = score(name, region)
+        return known(found) if finite else found
+
     return {
-        region: {name: known(score(name, region)) if finite else np.nan for name in measures}
-        | {"area": float(mask.mean())}
+        region: {name: told(name, region) for name in measures} | {"area": float(mask.mean())}
         for region, mask in masks.items()
         if mask.any()
     }

@@ -38,10 +38,12 @@ def test_methods_of_table_1_take_equally_many_steps():
     assert len({config.steps for config in configs.values()}) == 1
     assert len({config.density for config in configs.values()}) == 1
     assert {config.enhance for name, config in configs.items() if name.endswith("_4DGS")} == {
+        "none",
         "gamma",
         "clahe",
         "zero-dce",
     }
+    assert configs["curve_4DGS"].model.decomposition == "curve"
 
 
 def test_every_row_of_table_3_differs_from_the_whole_by_what_it_says():

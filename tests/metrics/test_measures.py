@@ -125,8 +125,10 @@ def test_a_pixel_that_is_no_number_leaves_none_of_the_whole():
     mask[:, :4] = True
     measures = metrics.BASIC | {"ssim_3dgs": SSIM_3DGS, "flip": FLIP}
     scores = metrics.compare(a, b, mask, measures=measures)
-    assert all(scores["overall"][name] is None for name in measures)
+    assert all(np.isnan(scores["overall"][name]) for name in measures)
     assert scores["dynamic"]["psnr"] == pytest.approx(-10 * np.log10(((a - b)[:, :4] ** 2).mean()))
+    summary = metrics.summarise([scores, metrics.compare(b, b, mask, measures=measures)])
+    assert all(summary["overall"][name] is None for name in measures)
 
 
 # A measure of which all conventions are easily told: the mean difference, halved twice in size.
