@@ -79,7 +79,6 @@ def _presets() -> dict[str, Config]:
             illumination_lr=1e-3,
             reflectance_lr=5e-3,  # 1e-5 moves a reflectance by 0.03 in 3,000 steps
             attenuation_lr=5e-3,
-            scales_lr=0.012,  # 3DGS's rate is for 25 times as many steps
             heads_lr=1.5e-3,
             planes_lr=1.6e-2,
             ocd_lr=5e-5,
@@ -93,10 +92,10 @@ def _presets() -> dict[str, Config]:
         default,
         fine_steps=4900,
         model=dataclasses.replace(default.model, hidden=128, plane_scales=(1, 2, 4)),
-        optim=dataclasses.replace(default.optim, scales_lr=5e-3, decay_steps=7500),
+        optim=dataclasses.replace(default.optim, decay_steps=7500),
         density=dataclasses.replace(default.density, stop=3000),
     )
-    # A smaller motion field and fewer steps, in which nothing is added.
+    # A smaller motion field and fewer steps, in which nothing is added; so sizes must learn faster.
     demo = dataclasses.replace(
         default,
         coarse_steps=150,
