@@ -42,6 +42,11 @@ CONFIG = dataclasses.replace(
     density=dataclasses.replace(DEFAULT.density, stop=0),
 )
 TENTH = dataclasses.replace(CONFIG, model=dataclasses.replace(CONFIG.model, moving_share=0.1))  # of them moves
+VARIANTS = {
+    "tenth_moving": TENTH,
+    "without_paths": dataclasses.replace(CONFIG, model=dataclasses.replace(CONFIG.model, tracks=False)),
+    "without_gates": dataclasses.replace(CONFIG, model=dataclasses.replace(CONFIG.model, motion_gate=False)),
+}
 SIZES = {"10k_160x96": (10_000, 160, 96), "50k_480x270": (50_000, 480, 270), "50k_800x450": (50_000, 800, 450)}
 STEPS = {"10k_200x112": (10_000, 200, 112), "40k_400x225": (40_000, 400, 225), "50k_800x450": (50_000, 800, 450)}
 SCALES = (  # Gaussians, frames, width, height
@@ -147,8 +152,8 @@ def parts() -> Figures:
 def step() -> Figures:
     """The whole fine step as `train` takes it: loss, gradient and Adam, two views, on two devices where there are."""
     figures = {f"{name}_ms": best_of(_stepper(*size), 5) for name, size in STEPS.items()}
-    figures["40k_400x225_tenth_moving_ms"] = best_of(_stepper(*STEPS["40k_400x225"], config=TENTH), 5)
-    return figures
+    size = STEPS["40k_400x225"]
+    return figures | {f"40k_400x225_{name}_ms": best_of(_stepper(*size, config=x), 5) for name, x in VARIANTS.items()}
 
 
 def rendering() -> Figures:
@@ -235,7 +240,7 @@ def _rendering(config: Config) -> Figures:
 
 
 def _stepper(
-    count: int, width: int, height: int, margin: float = 1.1, moving: bool = True, config: Config = CONFIG
+    count: int, width: int, height: int, margin: float = 1.3, moving: bool = True, config: Config = CONFIG
 ) -> Callable[[], Any]:
     """Takes the next training step at every call; the pair buffer holds `margin` times what the first one needs."""
     state, batch = training(count, width, height, config)

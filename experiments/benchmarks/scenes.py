@@ -1,5 +1,6 @@
 """Scenes of any size to measure on: random clouds that fill the view, as the golden tests use, and whole models."""
 
+import dataclasses
 from functools import partial
 
 import jax.numpy as jnp
@@ -9,7 +10,7 @@ from jax.scipy.special import logit
 from l2dgs_jax.config import Config
 from l2dgs_jax.data.dataset import Dataset, Split
 from l2dgs_jax.data.stacks import stacked
-from l2dgs_jax.model.initialisation import pad_rows
+from l2dgs_jax.model.initialisation import pad_rows, path_knots
 from l2dgs_jax.training import initial_state
 from l2dgs_jax.training.batching import load_batch
 from l2dgs_jax.training.step import Batch, TrainState, begin_stage
@@ -65,15 +66,24 @@ def video(count: int, width: int, height: int, frames: int, *, in_file: bool = F
 
 
 def fine_state(dataset: Dataset, config: Config) -> TrainState:
-    """The start of the fine stage, with the `cloud` of a `video` as Gaussians."""
-    arrays = cloud(len(dataset.points), dataset.width, dataset.height)
-    scene = initial_state(dataset, config).scene
+    """The start of the fine stage, with the `cloud` of a `video` as Gaussians and paths along which nothing moves."""
+    count, frames = len(dataset.points), len(dataset.train.names)
+    arrays = cloud(count, dataset.width, dataset.height)
+    # Tracks found in noise would add Gaussians.
+    scene = initial_state(
+        dataset, dataclasses.replace(config, model=dataclasses.replace(config.model, tracks=False))
+    ).scene
     rows = partial(pad_rows, capacity=len(scene.alive))
     gaussians = scene.params.gaussians._replace(
         quats=rows(jnp.asarray(arrays["quats"])),
         log_scales=rows(jnp.log(arrays["scales"])),
         logit_opacities=rows(logit(arrays["opacities"])),
     )
+    if config.model.tracks:
+        gaussians = gaussians._replace(
+            paths=rows(jnp.zeros((count, path_knots(frames), 3))),
+            lifetimes=rows(jnp.tile(jnp.array([0.0, 1.0]), (count, 1))),
+        )
     scene = scene._replace(params=scene.params._replace(gaussians=gaussians))
     return begin_stage(scene, jnp.asarray(config.coarse_steps, jnp.int32), config, config.fine_steps)
 
