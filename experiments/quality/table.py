@@ -40,10 +40,12 @@ class Table:
     Attributes:
         studies: folders that `sweep` has filled, or files that `json` has named.
         json: file for the numbers.
+        brief: low-light PSNR, PSNR after the gain and SSIM alone, rounded, all scenes in one table.
     """
 
     studies: tyro.conf.Positional[tuple[Path, ...]]
     json: Path | None = None
+    brief: bool = False
 
 
 def collect(studies: Sequence[Path]) -> Found:
@@ -84,17 +86,36 @@ def markdown(found: Found) -> str:
     return "\n".join(map(_table, scenes, parts))
 
 
+def brief(found: Found) -> str:
+    """One table with a row for each combination of settings and a column for each scene."""
+    scenes = list(dict.fromkeys(scene for rows in found.values() for scene in rows))
+    lines = [["low, gain / SSIM", *scenes], ["---"] * (len(scenes) + 1)]
+    lines += ([_label(row), *(_brief_cell(rows.get(scene)) for scene in scenes)] for row, rows in found.items())
+    return _lines(lines)
+
+
+def _brief_cell(scores: dict[str, list[float]] | None) -> str:
+    if not scores or "low" not in scores:
+        return ""
+    low, gain, ssim = (np.mean(scores[name]) if name in scores else np.nan for name in ("low", "gain", "SSIM"))
+    return f"{low:.1f}" if np.isnan(gain) else f"{low:.1f}, {gain:.1f} / {ssim:.2f}"
+
+
 def _table(corner: str, rows: dict[str, dict[str, list[float]]]) -> str:
     shown = [name for name in SCORES if any(name in scores for scores in rows.values())]
     lines = [[corner, "seeds", *shown], ["---"] * (len(shown) + 2)]
     for label, scores in rows.items():
         seeds = max(map(len, scores.values()), default=0)
         lines.append([label, str(seeds), *(_cell(name, scores.get(name)) for name in shown)])
+    return _lines(lines)
+
+
+def _lines(lines: Sequence[Sequence[str]]) -> str:
     return "".join(f"| {' | '.join(cells)} |\n" for cells in lines)
 
 
 def _label(row: Row) -> str:
-    return ", ".join(f"{name} {value}" for name, value in row) or "the preset"
+    return ", ".join(f"{name} {value}".strip() for name, value in row) or "the preset"
 
 
 def _cell(name: str, scores: list[float] | None) -> str:
@@ -112,7 +133,7 @@ def main() -> None:
     if options.json is not None:
         rows = [{"settings": dict(row), "scenes": scenes} for row, scenes in found.items()]
         options.json.write_text(json.dumps(rows) + "\n")
-    sys.stdout.write(markdown(found))
+    sys.stdout.write(brief(found) if options.brief else markdown(found))
 
 
 if __name__ == "__main__":

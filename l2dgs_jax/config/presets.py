@@ -1,4 +1,4 @@
-"""The named presets; docs/presets.md says why each setting of `default` is what it is, and what it measures.
+"""The named presets; docs/record.md says why each setting of `default` is what it is, and what it measures.
 
 `paper` is the text of the paper to the letter, `authors` what the authors' released code does, `default` what measures
 best, `fast` and `demo` a short `default`, `best` a long one. `4dgs`, `enhance-4dgs`, `curve-4dgs` and `static` are what

@@ -17,7 +17,8 @@ from l2dgs_jax.runtime.capacity import next_capacity
 from l2dgs_jax.training.seeds import find_seeds
 from l2dgs_jax.training.step import TrainState, begin_stage
 
-GAUSSIANS_PER_PIXEL = 0.3  # of a frame
+GAUSSIANS_PER_PIXEL = 0.6  # of a frame
+MOST_GAUSSIANS = 360_000  # however large the frames
 DRIFT = 0.05  # standard deviation of the logarithms of the frames' gains from which exposure counts as drifting
 
 
@@ -58,7 +59,7 @@ def resolve(config: Config, dataset: Dataset) -> Config:
 
 def _most_gaussians(split: Split) -> int:
     height, width = split.images.shape[1:3]
-    return round(GAUSSIANS_PER_PIXEL * height * width)
+    return min(round(GAUSSIANS_PER_PIXEL * height * width), MOST_GAUSSIANS)
 
 
 def initial_state(dataset: Dataset, config: Config) -> TrainState:

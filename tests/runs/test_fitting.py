@@ -1,5 +1,7 @@
 """`fit`: from a data set to a run, without files."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -50,6 +52,14 @@ def test_a_training_goes_on_from_a_state(dataset, quick):
     assert seen[0].pair_capacity == 2048
     finished = state._replace(step=jnp.int32(5))
     assert fit(dataset, config, start=Checkpoint(finished, 2048)).state is finished
+
+
+@pytest.mark.parametrize(("side", "found"), [(50, 1_500), (1_000, 360_000)])
+def test_how_many_gaussians_there_may_be_follows_the_pixels_up_to_a_bound(dataset, side, found):
+    frames = np.zeros((len(dataset.train.names), side, side, 3), np.float16)
+    large = dataclasses.replace(dataset, train=dataclasses.replace(dataset.train, images=frames))
+    config = overrides.replace(tiny(), {"density.max_gaussians": "auto"})
+    assert resolve(config, large).density.max_gaussians == found
 
 
 def test_what_is_left_to_the_data_is_filled_in(dataset, quick):

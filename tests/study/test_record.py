@@ -64,6 +64,19 @@ def test_a_seed_that_diverged_is_named_and_not_counted(tmp_path, capsys):
     assert "toys-0" not in named
 
 
+def test_a_brief_table_has_all_scenes_side_by_side():
+    found = {
+        (): {"toys": {"low": [36.0, 36.5], "gain": [24.0, 25.0], "SSIM": [0.9, 0.8]}, "shelf": {"low": [37.0]}},
+        (("", "without tracks"),): {"shelf": {"low": [36.0]}},
+    }
+    assert table.brief(found).splitlines() == [
+        "| low, gain / SSIM | toys | shelf |",
+        "| --- | --- | --- |",
+        "| the preset | 36.2, 24.5 / 0.85 | 37.0 |",
+        "| without tracks |  | 36.0 |",
+    ]
+
+
 def test_a_single_combination_has_a_row_for_each_scene():
     found = {(): {"toys": {"low": [36.0, 36.5], "SSIM": [0.9, 0.8]}, "room": {"low": [37.0]}}}
     assert table.markdown(found).splitlines() == [
@@ -76,5 +89,6 @@ def test_a_single_combination_has_a_row_for_each_scene():
 
 @pytest.mark.parametrize("path", RESULTS, ids=lambda path: path.stem)
 def test_the_documentation_shows_what_was_measured(path):
-    pages = [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]
-    assert any(table.markdown(table.collect([path])) in page.read_text() for page in pages)
+    pages = [page.read_text() for page in (ROOT / "README.md", *(ROOT / "docs").glob("*.md"))]
+    found = table.collect([path])
+    assert any(shown in page for page in pages for shown in (table.markdown(found), table.brief(found)))
