@@ -12,7 +12,7 @@ from l2dgs_jax.data import Dataset, Split
 from l2dgs_jax.runtime import devices
 from l2dgs_jax.training import engine, initial_state
 from l2dgs_jax.training.batching import load_batch
-from l2dgs_jax.training.step import StepReport
+from l2dgs_jax.training.state import StepReport
 from l2dgs_jax.types import Camera
 
 WIDTH, HEIGHT, FRAMES = 16, 12, 6

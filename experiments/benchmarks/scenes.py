@@ -13,7 +13,8 @@ from l2dgs_jax.data.stacks import stacked
 from l2dgs_jax.model.initialisation import pad_rows, path_knots
 from l2dgs_jax.training import initial_state
 from l2dgs_jax.training.batching import load_batch
-from l2dgs_jax.training.step import Batch, TrainState, begin_stage
+from l2dgs_jax.training.state import Batch, TrainState
+from l2dgs_jax.training.step import begin_stage
 from l2dgs_jax.types import Camera
 
 

@@ -95,10 +95,13 @@ def brief(found: Found) -> str:
 
 
 def _brief_cell(scores: dict[str, list[float]] | None) -> str:
-    if not scores or "low" not in scores:
+    if not scores:
         return ""
-    low, gain, ssim = (np.mean(scores[name]) if name in scores else np.nan for name in ("low", "gain", "SSIM"))
-    return f"{low:.1f}" if np.isnan(gain) else f"{low:.1f}, {gain:.1f} / {ssim:.2f}"
+    low, gain, ssim = (
+        f"{np.mean(scores[name]):.{digits}f}" if name in scores else "–"
+        for name, digits in (("low", 1), ("gain", 1), ("SSIM", 2))
+    )
+    return f"{low}, {gain} / {ssim}"
 
 
 def _table(corner: str, rows: dict[str, dict[str, list[float]]]) -> str:

@@ -20,7 +20,7 @@ from l2dgs_jax.config import EXECUTION, Config, from_dict, to_dict
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.runtime.files import flush, replacing
 from l2dgs_jax.training.initial_state import state_shapes
-from l2dgs_jax.training.step import TrainState
+from l2dgs_jax.training.state import TrainState
 
 _STEP = ".step"  # of the arrays in a file, that of `TrainState.step`
 VERSION = 2  # of the files; those of version 1 have no version and no halvings

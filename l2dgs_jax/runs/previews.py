@@ -15,7 +15,7 @@ from l2dgs_jax.data.images import encode_jpeg, to_bytes
 from l2dgs_jax.runs.run import Run
 from l2dgs_jax.runtime.capacity import next_capacity
 from l2dgs_jax.runtime.files import make_folder, replacing
-from l2dgs_jax.training.step import TrainState, with_capacity
+from l2dgs_jax.training.state import TrainState, with_capacity
 
 PREVIEWS = "previews"
 VIEWS = {"held-out": "test", "training": "train"}  # of which split

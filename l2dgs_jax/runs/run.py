@@ -7,7 +7,8 @@ from pathlib import Path
 from l2dgs_jax.config import Config
 from l2dgs_jax.data import Dataset
 from l2dgs_jax.model.rendering import Renderer
-from l2dgs_jax.training.step import TrainState, sh_degree
+from l2dgs_jax.training.objective import sh_degree
+from l2dgs_jax.training.state import TrainState
 from l2dgs_jax.types import Camera, RenderOutput
 
 

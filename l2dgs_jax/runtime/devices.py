@@ -103,3 +103,13 @@ def own_rows(array: Array) -> Iterator[int]:
         for index in range(*shard.index[0].indices(array.shape[0])):
             holders[index] = min(shard.device.process_index, holders.get(index, shard.device.process_index))
     return (index for index, holder in sorted(holders.items()) if holder == jax.process_index())
+
+
+def mean_over(tree: T, axis: str | None) -> T:
+    """Means over the devices of an axis of `jax.shard_map`; None for a single device."""
+    return tree if axis is None else jax.lax.pmean(tree, axis)
+
+
+def max_over(x: Array, axis: str | None) -> Array:
+    """The maximum over the devices of an axis, as `mean_over`."""
+    return x if axis is None else jax.lax.pmax(x, axis)

@@ -2,7 +2,7 @@
 
 from l2dgs_jax.training.engine import DivergedError, Member, Progress
 from l2dgs_jax.training.initial_state import initial_state, resolve, state_shapes
-from l2dgs_jax.training.step import Batch, StepReport, TrainState
+from l2dgs_jax.training.state import Batch, StepReport, TrainState
 
 __all__ = [
     "Batch",

@@ -9,7 +9,7 @@ from l2dgs_jax.config import Config
 from l2dgs_jax.data.dataset import Split
 from l2dgs_jax.training.flows import Flows
 from l2dgs_jax.training.inbetweens import draw
-from l2dgs_jax.training.step import Batch
+from l2dgs_jax.training.state import Batch
 from l2dgs_jax.types import Camera
 
 

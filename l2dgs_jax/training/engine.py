@@ -22,16 +22,8 @@ from l2dgs_jax.runtime.devices import MEMBERS, VIEWS
 from l2dgs_jax.runtime.prefetch import prefetch
 from l2dgs_jax.training.batching import load_batch, next_batch
 from l2dgs_jax.training.flows import neighbour_flows
-from l2dgs_jax.training.step import (
-    Batch,
-    StepReport,
-    TrainState,
-    begin_stage,
-    densify,
-    train_step,
-    tree_where,
-    with_capacity,
-)
+from l2dgs_jax.training.state import Batch, StepReport, TrainState, with_capacity
+from l2dgs_jax.training.step import begin_stage, densify, train_step, tree_where
 from l2dgs_jax.types import Scene
 
 T = TypeVar("T")

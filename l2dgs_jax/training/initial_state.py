@@ -15,7 +15,8 @@ from l2dgs_jax.model.tone import Darkening, darkening, recognise
 from l2dgs_jax.model.tone_curves import equalising_law, power_law
 from l2dgs_jax.runtime.capacity import next_capacity
 from l2dgs_jax.training.seeds import find_seeds
-from l2dgs_jax.training.step import TrainState, begin_stage
+from l2dgs_jax.training.state import TrainState
+from l2dgs_jax.training.step import begin_stage
 
 GAUSSIANS_PER_PIXEL = 0.6  # of a frame
 MOST_GAUSSIANS = 360_000  # however large the frames

@@ -16,7 +16,7 @@ from l2dgs_jax.cameras.geometry import mean_up
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.runs.run import Run
 from l2dgs_jax.runtime.extras import extra
-from l2dgs_jax.training.step import TrainState
+from l2dgs_jax.training.state import TrainState
 from l2dgs_jax.viewer.guest import Guest
 from l2dgs_jax.viewer.ladder import ladder
 from l2dgs_jax.viewer.renderers import Renderers

@@ -14,7 +14,7 @@ from l2dgs_jax.errors import UserError
 from l2dgs_jax.runs import Checkpoint, fit, open_run, save_run
 from l2dgs_jax.runtime import devices
 from l2dgs_jax.training import engine, initial_state, resolve
-from l2dgs_jax.training.step import StepReport
+from l2dgs_jax.training.state import StepReport
 
 
 @pytest.fixture

@@ -72,8 +72,8 @@ def test_a_brief_table_has_all_scenes_side_by_side():
     assert table.brief(found).splitlines() == [
         "| low, gain / SSIM | toys | shelf |",
         "| --- | --- | --- |",
-        "| the preset | 36.2, 24.5 / 0.85 | 37.0 |",
-        "| without tracks |  | 36.0 |",
+        "| the preset | 36.2, 24.5 / 0.85 | 37.0, – / – |",
+        "| without tracks |  | 36.0, – / – |",
     ]
 
 

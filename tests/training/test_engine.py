@@ -13,8 +13,9 @@ from l2dgs_jax.model.rendering import Renderer
 from l2dgs_jax.runs import checkpoints
 from l2dgs_jax.runs.checkpoints import Checkpoint
 from l2dgs_jax.runtime.capacity import next_capacity
-from l2dgs_jax.training import engine, initial_state, step
+from l2dgs_jax.training import engine, initial_state, objective, step
 from l2dgs_jax.training.batching import load_batch
+from l2dgs_jax.training.state import with_capacity
 from l2dgs_jax.types import Camera
 
 
@@ -47,7 +48,7 @@ def objective_of(dataset, config, moving):
     probe = jnp.zeros((2, state.scene.alive.shape[0], 2))
 
     def value(params, probe):
-        return step.objective(params, probe, state, batch, config, moving, 4096)[0]
+        return objective.objective(params, probe, state, batch, config, moving, 4096)[0]
 
     return jax.jit(jax.value_and_grad(value, argnums=(0, 1))), params, probe
 
@@ -113,8 +114,8 @@ def test_nothing_is_learned_from_pixels_that_do_not_count(dataset):
         states.append(initial_state(dataclasses.replace(dataset, train=split), config))
         batch = load_batch(split, np.array([1, 4]))
         batch = batch._replace(images=jnp.asarray(batch.images, float))
-        targets.append(step.targets(batch, estimate))
-        assert jnp.all(jax.grad(lambda x, batch=batch: step.targets(batch, x)[0].sum())(estimate) == 0)
+        targets.append(objective.targets(batch, estimate))
+        assert jnp.all(jax.grad(lambda x, batch=batch: objective.targets(batch, x)[0].sum())(estimate) == 0)
     assert_equal_states(*states)
     assert_equal_states(*targets)
     seen = valid[[1, 4]]
@@ -130,7 +131,7 @@ def test_a_step_takes_a_mask_of_pixels_that_count(dataset):
     batch = batch_of(dataset.train, [1, 4])
     half = jnp.arange(WIDTH) < WIDTH // 2
     report = jax.jit(
-        lambda valid: step.objective(
+        lambda valid: objective.objective(
             state.scene.params, probe, state, batch._replace(valid=valid), config, False, 4096
         )[1][0]
     )
@@ -176,7 +177,7 @@ def test_a_stage_compiles_once_and_dead_rows_are_inert(dataset):
     compiled = engine.train_steps._cache_size()
     plain = state_of(finish(dataset, config, pair_capacity=8192))
     assert engine.train_steps._cache_size() == compiled + 2
-    wide = state_of(finish(dataset, config, step.with_capacity(initial_state(dataset, config), 2000), 8192))
+    wide = state_of(finish(dataset, config, with_capacity(initial_state(dataset, config), 2000), 8192))
     rows = plain.scene.alive.shape[0]
     for x, y in zip(*map(jax.tree.leaves, (plain.scene.params.gaussians, wide.scene.params.gaussians)), strict=True):
         np.testing.assert_allclose(x, y[:rows], rtol=1e-6, atol=1e-9)
@@ -185,7 +186,7 @@ def test_a_stage_compiles_once_and_dead_rows_are_inert(dataset):
 
 def test_the_first_pair_buffer_fits_the_first_views(dataset):
     config = tiny()
-    scene = step.with_capacity(initial_state(dataset, config), 1500).scene
+    scene = with_capacity(initial_state(dataset, config), 1500).scene
     gaussians = scene.params.gaussians
     everywhere = gaussians._replace(
         means=jnp.zeros_like(gaussians.means).at[:, 2].set(2), log_scales=jnp.ones_like(gaussians.log_scales)

@@ -9,7 +9,7 @@ from jax.test_util import check_grads
 from tiny_training import FRAMES, finish, make_dataset, state_of, tiny
 
 from l2dgs_jax.config import overrides
-from l2dgs_jax.training import initial_state, resolve, step
+from l2dgs_jax.training import initial_state, objective, resolve
 from l2dgs_jax.training.batching import load_batch
 
 GAINS = np.linspace(-0.3, 0.3, FRAMES)
@@ -42,13 +42,13 @@ def test_training_starts_from_the_gains_that_the_frames_show():
 def test_estimates_are_exposed_like_their_frames():
     images = jnp.full((2, 3, 4, 3), 0.2)
     exposures = jnp.log(jnp.array([[1.0, 1, 1], [2, 4, 8], [1, 0.25, 0.125]]))
-    seen = step.exposed(images, exposures, jnp.array([1, 2]))
+    seen = objective.exposed(images, exposures, jnp.array([1, 2]))
     # Relative to their geometric mean, which is [2, 1, 1]^(1/3).
     np.testing.assert_allclose(seen[0, 0, 0], 0.2 * np.array([2, 4, 8]) / np.array([2 ** (1 / 3), 1, 1]), rtol=1e-6)
     np.testing.assert_allclose(
         seen[1, 0, 0], 0.2 * np.array([1, 0.25, 0.125]) / np.array([2 ** (1 / 3), 1, 1]), rtol=1e-6
     )
-    check_grads(lambda *x: step.exposed(*map(jnp.asarray, x), jnp.array([1, 2])), (images, exposures), 1)
+    check_grads(lambda *x: objective.exposed(*map(jnp.asarray, x), jnp.array([1, 2])), (images, exposures), 1)
 
 
 def test_training_moves_the_gains_to_what_the_frames_say():

@@ -8,7 +8,7 @@ import pytest
 from tiny_training import batch_of, make_dataset, tiny
 
 from l2dgs_jax.model.deformation import deform
-from l2dgs_jax.training import initial_state, step
+from l2dgs_jax.training import initial_state, objective
 
 
 @pytest.fixture(scope="module")
@@ -20,7 +20,7 @@ def state():
 def test_their_share_grows_to_the_end_of_the_run(state):
     config = tiny(drop=0.4)
     for number in (0, config.steps // 2, config.steps - 1):
-        factors = np.asarray(step.presence(state._replace(step=jnp.int32(number)), config))
+        factors = np.asarray(objective.presence(state._replace(step=jnp.int32(number)), config))
         share = 0.4 * number / config.steps
         assert abs(np.mean(factors == 0) - share) < 0.05
         np.testing.assert_allclose(factors[factors > 0], 1 / (1 - share), rtol=1e-6)
@@ -28,10 +28,10 @@ def test_their_share_grows_to_the_end_of_the_run(state):
 
 def test_every_step_leaves_out_others_and_always_the_same(state):
     config = tiny(drop=0.4)
-    one, again, other = (step.presence(state._replace(step=jnp.int32(n)), config) for n in (5, 5, 6))
+    one, again, other = (objective.presence(state._replace(step=jnp.int32(n)), config) for n in (5, 5, 6))
     np.testing.assert_array_equal(one, again)
     assert ((one == 0) != (other == 0)).any()
-    assert step.presence(state, tiny()) is None
+    assert objective.presence(state, tiny()) is None
 
 
 def test_what_is_left_out_is_not_there_and_the_rest_stays_below_one(state):

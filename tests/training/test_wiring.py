@@ -14,9 +14,11 @@ from l2dgs_jax.config import DensityConfig, overrides
 from l2dgs_jax.config.settings import RATE_GROUPS
 from l2dgs_jax.model import hexplane
 from l2dgs_jax.runtime import devices
-from l2dgs_jax.training import engine, initial_state, step
+from l2dgs_jax.training import engine, initial_state, losses, objective
 from l2dgs_jax.training.batching import view_indices
 from l2dgs_jax.training.parameter_groups import groups
+from l2dgs_jax.training.state import StepReport
+from l2dgs_jax.training.step import train_step
 
 COARSE, FINE = 10, 15
 
@@ -33,7 +35,7 @@ def config_of(**changes):
 def passed_on(dataset, monkeypatch, config, moving):
     """A function of a step's number: the exponent of Eq. 10, the target of B1's prior and the SH bands that it uses."""
     seen = {}
-    render, total = step.render, step.losses.total
+    render, total = objective.render, losses.total
 
     def spy_on_render(*arguments, **options):
         seen["sh_degree"] = options["sh_degree"]
@@ -43,14 +45,14 @@ def passed_on(dataset, monkeypatch, config, moving):
         seen.update(eta=eta, exponent_target=exponent_target)
         return total(output, target, cfg, eta, exponent_target)
 
-    monkeypatch.setattr(step, "render", spy_on_render)
-    monkeypatch.setattr(step.losses, "total", spy_on_total)
+    monkeypatch.setattr(objective, "render", spy_on_render)
+    monkeypatch.setattr(losses, "total", spy_on_total)
     state, batch = initial_state(dataset, config), batch_of(dataset.train, [0, 3])
     probe = jnp.zeros((2, len(state.scene.alive), 2))
 
     @jax.jit
     def look(number):
-        step.objective(state.scene.params, probe, state._replace(step=number), batch, config, moving, 4096)
+        objective.objective(state.scene.params, probe, state._replace(step=number), batch, config, moving, 4096)
         return dict(seen)
 
     return lambda number: {name: float(value) for name, value in look(jnp.int32(number)).items()}
@@ -98,7 +100,7 @@ def test_the_planes_are_smoothed_in_the_fine_stage_only(dataset):
     @jax.jit
     def added(state):
         plain = overrides.replace(config, dict.fromkeys(weights, 0.0))
-        loss = lambda config, moving: step.objective(params, probe, state, batch, config, moving, 4096)[0]
+        loss = lambda config, moving: objective.objective(params, probe, state, batch, config, moving, 4096)[0]
         return [loss(config, moving) - loss(plain, moving) for moving in (False, True)]
 
     coarse, fine = added(state)
@@ -113,7 +115,7 @@ def journal(monkeypatch):
 
     def take(states, batches, values, number, *, config, moving, pair_capacity, mesh):
         entries.steps.append((number, moving, np.asarray(batches.cameras.time)[0].tolist()))
-        report = step.StepReport(*[jnp.zeros(1)] * 6)
+        report = StepReport(*[jnp.zeros(1)] * 6)
         return states._replace(step=states.step + 1), report, engine.Tally(0, 1)
 
     begin = engine.begin_fine_stage
@@ -192,7 +194,7 @@ def test_every_rate_moves_its_parameters_and_no_others(dataset):
     leaves = [x + 0.03 * jax.random.normal(key, x.shape) for x, key in zip(leaves, keys, strict=True)]
     params = treedef.unflatten(leaves)
     state = state._replace(scene=state.scene._replace(params=params), step=jnp.int32(20))
-    take = jax.jit(lambda state: step.train_step(state, batch, config, moving=True, pair_capacity=4096)[0])
+    take = jax.jit(lambda state: train_step(state, batch, config, moving=True, pair_capacity=4096)[0])
     labels = jax.tree.leaves(groups(params))
     for name in state.adam.schedules:
         rates = {
@@ -229,7 +231,7 @@ def test_weights_on_sizes_and_the_gate(dataset):
     @partial(jax.jit, static_argnums=1)
     def loss(weights, moving):
         config = overrides.replace(bare, {f"loss.{name}": weight for name, weight in weights.items()})
-        return step.objective(state.scene.params, probe, state, batch, config, moving, 4096)[0]
+        return objective.objective(state.scene.params, probe, state, batch, config, moving, 4096)[0]
 
     for moving in (False, True):
         plain = loss(dict.fromkeys(sizes, 0.0), moving)
@@ -250,7 +252,7 @@ def test_depth_of_the_scene_counts_by_its_weight(dataset):
     def losses():
         def loss(batch, weight):
             own = overrides.replace(config, {"loss.depth_input": weight})
-            value, (report, _) = step.objective(state.scene.params, probe, state, batch, own, False, 4096)
+            value, (report, _) = objective.objective(state.scene.params, probe, state, batch, own, False, 4096)
             return value, report.terms
 
         return loss(batch, 3.0), loss(given, 0.0), loss(given, 3.0)
@@ -265,4 +267,5 @@ def test_depth_of_the_scene_counts_by_its_weight(dataset):
 def test_bands_by_the_length_of_the_run(dataset):
     config = dataclasses.replace(config_of(), coarse_steps=40, fine_steps=80, sh_warmup=None)
     config = dataclasses.replace(config, model=dataclasses.replace(config.model, sh_degree=3))
-    assert [int(step.sh_degree(number, config)) for number in (0, 19, 20, 40, 59, 60, 119)] == [0, 0, 1, 2, 2, 3, 3]
+    bands = [int(objective.sh_degree(number, config)) for number in (0, 19, 20, 40, 59, 60, 119)]
+    assert bands == [0, 0, 1, 2, 2, 3, 3]
