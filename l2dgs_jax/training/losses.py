@@ -203,8 +203,8 @@ def darkening(
 ) -> Scalar:
     """Mean |I_w - the low-light estimate with its darkening undone|; only `welllit` carries gradients.
 
-    The factor of the darkening is the one that suits all views best, so the term says nothing about brightness. It
-    does what B1 cannot: underexposure is no power law, and costs highlights most.
+    Its factor leaves a view as much light as it has, so the term says nothing about brightness. It does what a start
+    and a prior of B1 cannot: scaled light is no power law of sRGB values, and highlights would come out too dark.
 
     Args:
         welllit: I_w, sRGB.
@@ -215,8 +215,8 @@ def darkening(
         lit, dark = srgb_to_linear(welllit), srgb_to_linear(lowlight)
     else:
         lit, dark = power(welllit, jnp.asarray(_exponent(tone), welllit.dtype)), lowlight
-    factor = jnp.vdot(lit, dark) / jnp.maximum(jnp.vdot(dark, dark), jnp.finfo(dark.dtype).tiny)
-    undone = jnp.clip(factor * dark, 0, 1)
+    mean = lambda light: light.mean((-3, -2, -1), keepdims=True)
+    undone = jnp.clip(mean(lit) / jnp.maximum(mean(dark), jnp.finfo(dark.dtype).tiny) * dark, 0, 1)
     undone = linear_to_srgb(undone) if tone == "linear-light" else undone ** (1 / _exponent(tone))
     return jnp.abs(welllit - jax.lax.stop_gradient(undone)).mean()
 
