@@ -159,7 +159,6 @@ class LossConfig:
     depth_input: Number = 0.0  # difference from the scene's own depth, if it has any (training/given_depth.py)
     illumination_tv: Number = 0.0  # mean |forward difference| of L_w
     exponent_prior: Number = 0.0  # mean |B1 - initial B1|
-    tone: Number = 0.0  # difference of I_w from the low-light estimate with the darkening of model.tone undone
     plane_smoothness: Number = 2e-4  # second differences along the space planes' first axis, fine stage only
     time_smoothness: Number = 1e-3  # second differences in t
     time_l1: Number = 1e-4  # mean |1 - plane| of the time planes

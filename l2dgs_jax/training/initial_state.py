@@ -32,7 +32,10 @@ def split_darkening(split: Split, config: Config) -> Darkening:
         return Darkening(1.0, 1.0)
     if config.model.decomposition == "curve":
         return equalising_law(split.images, split.valid)
-    return darkening(split.mean_level, float(config.loss.exposure_level), config.model.tone)
+    tone = config.model.tone
+    if tone == "auto":
+        tone = recognise(split.images, split.valid)
+    return darkening(split.mean_level, float(config.loss.exposure_level), tone)
 
 
 def resolve(config: Config, dataset: Dataset) -> Config:
@@ -43,9 +46,6 @@ def resolve(config: Config, dataset: Dataset) -> Config:
     if config.model.exposure == "auto":
         drift = exposures(dataset.points, split.cameras, split.images, split.valid).std(0).max() > DRIFT
         config = overrides.replace(config, {"model.exposure": "drifting" if drift else "steady"})
-    if config.model.tone == "auto":
-        tone = recognise(split.images, split.valid)
-        config = dataclasses.replace(config, model=dataclasses.replace(config.model, tone=tone))
     model = config.model
     if "auto" not in (*(model.initial_exponents or ()), model.initial_illumination):
         return config

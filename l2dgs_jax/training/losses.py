@@ -6,13 +6,11 @@ Every term is a mean over pixels and views; a mean over no pixel at all (differe
 from collections.abc import Callable
 from typing import Literal
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from l2dgs_jax import metrics
 from l2dgs_jax.config import LossConfig
-from l2dgs_jax.data.color import linear_to_srgb, srgb_to_linear
 from l2dgs_jax.model.decomposition import power
 from l2dgs_jax.types import RenderOutput
 
@@ -194,35 +192,6 @@ def total_variation(image: Float[Array, "*B H W"]) -> Scalar:
 def exponent_prior(attenuation: Float[Array, "*B H W 2"], target: Scalar | float) -> Scalar:
     """Mean |B1 - target|: keeps the colours of the well-lit image from drifting with the exponent of R_w."""
     return jnp.abs(attenuation[..., 0] - target).mean()
-
-
-def darkening(
-    welllit: Float[Array, "*B H W C"],
-    lowlight: Float[Array, "*B H W C"],
-    tone: Literal["linear-light", "gain"] | float,
-) -> Scalar:
-    """Mean |I_w - the low-light estimate with its darkening undone|; only `welllit` carries gradients.
-
-    Its factor leaves a view as much light as it has, so the term says nothing about brightness. It does what a start
-    and a prior of B1 cannot: scaled light is no power law of sRGB values, and highlights would come out too dark.
-
-    Args:
-        welllit: I_w, sRGB.
-        lowlight: the estimate of I_d, sRGB.
-        tone: a factor on light, or on sRGB values ("gain"), or on them to that power of the well-lit ones.
-    """
-    if tone == "linear-light":
-        lit, dark = srgb_to_linear(welllit), srgb_to_linear(lowlight)
-    else:
-        lit, dark = power(welllit, jnp.asarray(_exponent(tone), welllit.dtype)), lowlight
-    mean = lambda light: light.mean((-3, -2, -1), keepdims=True)
-    undone = jnp.clip(mean(lit) / jnp.maximum(mean(dark), jnp.finfo(dark.dtype).tiny) * dark, 0, 1)
-    undone = linear_to_srgb(undone) if tone == "linear-light" else undone ** (1 / _exponent(tone))
-    return jnp.abs(welllit - jax.lax.stop_gradient(undone)).mean()
-
-
-def _exponent(tone: str | float) -> float:
-    return 1.0 if isinstance(tone, str) else tone
 
 
 def _mean(values: Float[Array, "..."]) -> Scalar:

@@ -84,8 +84,6 @@ def objective(
         smoothness, time_smoothness, time_l1 = hexplane.regularisers(params.hexplane)
         loss += cfg.plane_smoothness * smoothness + cfg.time_smoothness * time_smoothness + cfg.time_l1 * time_l1
     others = size_terms(state.scene._replace(params=params), config, moving) | curve_terms(params.curves, batch, cfg)
-    scene_images, tone = output.images, config.model.tone
-    others["tone"] = (cfg.tone, lambda: losses.darkening(scene_images.welllit, scene_images.lowlight, tone))
     if batch.depths is not None:
         depths = batch.depths
         others["depth_input"] = (cfg.depth_input, lambda: depth_disagreement(output.depth, output.alpha, depths))

@@ -10,7 +10,6 @@ import pytest
 from jax.test_util import check_grads
 
 from l2dgs_jax.config import LossConfig
-from l2dgs_jax.data.color import linear_to_srgb, srgb_to_linear
 from l2dgs_jax.training import losses
 from l2dgs_jax.types import Decomposition, RenderOutput
 
@@ -216,35 +215,6 @@ def test_exponent_prior_pulls_the_first_exponent_alone():
     close(losses.exponent_prior(attenuation, 1.2), np.mean([abs(b - 1.2) for b in b1]))
     grads_agree(lambda a: losses.exponent_prior(a, 1.2), attenuation)
     assert not jax.grad(losses.exponent_prior)(attenuation, 1.2)[..., 1].any()
-
-
-def darkened(welllit, tone, factor):
-    if tone == "linear-light":
-        return linear_to_srgb(factor * srgb_to_linear(welllit))
-    return factor * welllit ** (1.0 if tone == "gain" else tone)
-
-
-@pytest.mark.parametrize("tone", ["linear-light", "gain", 1.5])
-def test_darkening_is_none_where_the_tone_explains_it_however_dark_it_is(tone):
-    welllit = uniform(0, V, H, W, 3)
-    dark = jnp.stack([darkened(view, tone, factor) for view, factor in zip(welllit, (0.01, 0.2), strict=True)])
-    close(losses.darkening(welllit, dark, tone), 0)
-    others = [losses.darkening(welllit, dark, other) for other in ("linear-light", "gain", 1.5) if other != tone]
-    assert min(others) > 0.01
-
-
-def test_darkening_teaches_the_welllit_image_alone():
-    welllit, dark = uniform(0, V, H, W, 3), 0.2 * uniform(1, V, H, W, 3)
-    welllit_gradient, dark_gradient = jax.grad(losses.darkening, (0, 1))(welllit, dark, "linear-light")
-    np.testing.assert_allclose(jnp.abs(welllit_gradient), 1 / welllit.size)
-    assert not dark_gradient.any()
-
-
-@pytest.mark.parametrize("tone", ["linear-light", "gain", 1.5])
-def test_darkening_of_black_is_finite(tone):
-    value, gradient = jax.value_and_grad(losses.darkening)(jnp.zeros((1, H, W, 3)), jnp.zeros((1, H, W, 3)), tone)
-    assert value == 0
-    assert jnp.isfinite(gradient).all()
 
 
 def test_eta_decays_exponentially_and_then_stays():
