@@ -111,6 +111,10 @@ class ModelConfig:
     # How the frames became dark: "linear-light", by little light; "gain", by a factor on their sRGB values; "auto",
     # what they look like (model/tone.py); or a number, the exponent that B1 starts at where it is "auto"
     tone: float | Literal["linear-light", "gain", "auto"] = "linear-light"
+    # What Eqs. 7 and 9 speak of: sRGB "values", as in the paper, or the "light" that they stand for, of which a camera
+    # in the dark gets a part; "auto": light if that is what `tone` says
+    domain: Literal["values", "light", "auto"] = "values"
+    relative_light: bool = False  # in Eq. 7, L_w over what it starts from: I_w need not be darker than that
     initial_opacity: Number = 0.1  # of every Gaussian
     # Whether every training frame has a gain of its own, learned beside the scene; "auto": if the points say so
     exposure: Literal["steady", "drifting", "auto"] = "steady"

@@ -17,4 +17,5 @@ def srgb_to_linear(value: AnyArray) -> AnyArray:
 def linear_to_srgb(value: AnyArray) -> AnyArray:
     """The sRGB transfer function (IEC 61966-2-1), of values [*S] >= 0."""
     where = value.__array_namespace__().where
-    return where(value <= 0.0031308, value * 12.92, 1.055 * value ** (1 / 2.4) - 0.055)
+    low = value <= 0.0031308  # where the power has no gradient that is finite
+    return where(low, value * 12.92, 1.055 * where(low, 1, value) ** (1 / 2.4) - 0.055)

@@ -19,6 +19,7 @@ from l2dgs_jax.cameras import select_camera
 from l2dgs_jax.config import ModelConfig
 from l2dgs_jax.exporters.splats import Splats
 from l2dgs_jax.metrics import psnr
+from l2dgs_jax.model.decomposition import as_light, full_light, product
 from l2dgs_jax.model.deformation import deform, length_unit
 from l2dgs_jax.model.rendering import Renderer
 from l2dgs_jax.rasterizer import rasterize
@@ -70,7 +71,8 @@ def bake(
         exact = _exact(renderer, cameras, images)
         if colors is None:
             levels = exact.mean((0, 1, 2))
-            own = moved.illumination.mean(0)[:, None] * moved.reflectance[0]
+            light = moved.illumination.mean(0) / full_light(cfg)
+            own = product(light, as_light(jnp.clip(moved.reflectance[0], 0, 1), cfg), cfg)
             colors = jnp.clip(jnp.tile(own, len(images)) * _gains(levels)[None], 0, brightest)
         _, drawn = _blend(colors, geometry, cameras, canvas)
         room = next_capacity(int(drawn.pairs))

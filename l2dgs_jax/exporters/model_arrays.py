@@ -8,6 +8,7 @@ from jaxtyping import Shaped
 
 from l2dgs_jax.data.dataset import Split
 from l2dgs_jax.errors import UserError
+from l2dgs_jax.model.decomposition import full_light
 from l2dgs_jax.model.deformation import acting, length_unit
 from l2dgs_jax.rasterizer.projection import NEAR_PLANE
 from l2dgs_jax.runs import Run
@@ -49,6 +50,8 @@ def model_arrays(run: Run) -> dict[str, Shaped[np.ndarray, "..."]]:
         "box_rim": cfg.box_rim,
         "illumination_offset": cfg.illumination_offset,
         "background": cfg.background,
+        "domain": cfg.domain,
+        "full_light": full_light(cfg),
         "width": dataset.width,
         "height": dataset.height,
         "train": _cameras(dataset.train),

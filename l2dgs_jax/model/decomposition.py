@@ -5,6 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from l2dgs_jax.config import ModelConfig
+from l2dgs_jax.data.color import linear_to_srgb, srgb_to_linear
 from l2dgs_jax.kernels.fusion import fusion_boundary, repeat_channels
 from l2dgs_jax.model import channels
 from l2dgs_jax.model.networks import apply_bafe, bounded_exponents
@@ -20,7 +21,7 @@ def decompose(features: Float[Array, "*B H W 6"], bafe: BAFENet, cfg: ModelConfi
     Args:
         features: blended channels, any real values (Eqs. 5, 6, 8; see `channels`).
         bafe: parameters of BAFE-Net.
-        cfg: `decomposition`, `bafe` and `unit_exponent`.
+        cfg: `decomposition`, `domain`, `relative_light`, `bafe` and `unit_exponent`.
 
     Returns:
         The images of Eqs. 5-9; a base of 0 stays 0 in the low-light image and passes no gradient to its exponent.
@@ -42,13 +43,33 @@ def decompose(features: Float[Array, "*B H W 6"], bafe: BAFENet, cfg: ModelConfi
     if cfg.unit_exponent is not None:
         attenuation = attenuation.at[..., ("b1", "b2").index(cfg.unit_exponent)].set(1)
     return Decomposition(
-        welllit=repeat_channels(illumination, 3) * reflectance,
-        lowlight=repeat_channels(power(illumination, attenuation[..., 1]), 3)
-        * power(reflectance, repeat_channels(attenuation[..., 0], 3)),
+        welllit=product(illumination / full_light(cfg), as_light(reflectance, cfg), cfg),
+        lowlight=product(
+            power(illumination, attenuation[..., 1]),
+            power(as_light(reflectance, cfg), repeat_channels(attenuation[..., 0], 3)),
+            cfg,
+        ),
         illumination=illumination,
         reflectance=reflectance,
         attenuation=attenuation,
     )
+
+
+def as_light(reflectance: Float[Array, "*S"], cfg: ModelConfig) -> Float[Array, "*S"]:
+    """What Eqs. 7 and 9 multiply and raise to a power: by `cfg.domain` R_w itself, or the light that it stands for."""
+    return srgb_to_linear(reflectance) if cfg.domain == "light" else reflectance
+
+
+def product(light: Float[Array, "*B"], color: Float[Array, "*B 3"], cfg: ModelConfig) -> Float[Array, "*B 3"]:
+    """Light times colour, as `as_light` gives it, in sRGB values; both carry gradients where it is at most 1."""
+    image = repeat_channels(light, 3) * color
+    image = linear_to_srgb(image) if cfg.domain == "light" else image
+    return clip_unit(image) if cfg.relative_light else image
+
+
+def full_light(cfg: ModelConfig) -> Float[Array, ""] | float:
+    """The L_w under which I_w is R_w: 1, or with `cfg.relative_light` what it starts from."""
+    return cfg.initial_illumination if cfg.relative_light else 1.0  # type: ignore[return-value]  # "auto" is resolved
 
 
 def clip_unit(x: Float[Array, "*S"]) -> Float[Array, "*S"]:

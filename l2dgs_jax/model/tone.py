@@ -20,13 +20,22 @@ LOOKED_AT = 12  # frames
 
 
 class Darkening(NamedTuple):
-    """An underexposed sRGB value as gain * (well-exposed value)^exponent."""
+    """An underexposed value as gain * (well-exposed value)^exponent: sRGB values, or the light they stand for."""
 
     exponent: float
     gain: float
+    of_light: bool = False
+
+    def undone(self, values: Float[np.ndarray, "*S"]) -> Float[np.ndarray, "*S"]:
+        """The well-exposed sRGB values."""
+        if not self.of_light:
+            return (values / self.gain) ** (1 / self.exponent)
+        return linear_to_srgb((srgb_to_linear(values) / self.gain) ** (1 / self.exponent))
 
 
-def darkening(dark_level: float, lit_level: float, tone: Tone | float = "linear-light") -> Darkening:
+def darkening(
+    dark_level: float, lit_level: float, tone: Tone | float = "linear-light", *, of_light: bool = False
+) -> Darkening:
     """The power law that describes an underexposed sRGB image of mean `dark_level`.
 
     Light scaled by k before the sRGB curve is close to a gain times a power of the well-exposed value after it, with
@@ -38,7 +47,11 @@ def darkening(dark_level: float, lit_level: float, tone: Tone | float = "linear-
         lit_level: mean sRGB value that a well-lit image is expected to have.
         tone: how it became dark: "linear-light", as a camera does; by a "gain" on sRGB values, as many programs do; or
             the exponent itself.
+        of_light: whether the law is to be one of light, where "linear-light" is a gain.
     """
+    if of_light:
+        dark, lit = srgb_to_linear(np.array([dark_level, lit_level]))
+        return Darkening(LEAST_EXPONENT, min(dark / lit**LEAST_EXPONENT, 1.0), of_light=True)
     if tone == "linear-light":
         dark, lit = srgb_to_linear(np.array([dark_level, lit_level]))
         well = np.linspace(0.1, 0.9, 81)

@@ -32,10 +32,10 @@ def split_darkening(split: Split, config: Config) -> Darkening:
         return Darkening(1.0, 1.0)
     if config.model.decomposition == "curve":
         return equalising_law(split.images, split.valid)
-    tone = config.model.tone
+    tone, level = config.model.tone, float(config.loss.exposure_level)
     if tone == "auto":
         tone = recognise(split.images, split.valid)
-    return darkening(split.mean_level, float(config.loss.exposure_level), tone)
+    return darkening(split.mean_level, level, tone, of_light=config.model.domain == "light")
 
 
 def resolve(config: Config, dataset: Dataset) -> Config:
@@ -47,9 +47,13 @@ def resolve(config: Config, dataset: Dataset) -> Config:
         drift = exposures(dataset.points, split.cameras, split.images, split.valid).std(0).max() > DRIFT
         config = overrides.replace(config, {"model.exposure": "drifting" if drift else "steady"})
     model = config.model
+    if model.domain == "auto":
+        tone = recognise(split.images, split.valid) if model.tone == "auto" else model.tone
+        model = dataclasses.replace(model, domain="light" if tone == "linear-light" else "values")
+    config = dataclasses.replace(config, model=model)
     if "auto" not in (*(model.initial_exponents or ()), model.initial_illumination):
         return config
-    exponent, gain = split_darkening(split, config)
+    exponent, gain, _ = split_darkening(split, config)
     if model.initial_exponents and model.initial_exponents[0] == "auto":
         model = dataclasses.replace(model, initial_exponents=(round(exponent, 3), model.initial_exponents[1]))
     if model.initial_illumination == "auto":
@@ -80,7 +84,7 @@ def initial_state(dataset: Dataset, config: Config) -> TrainState:
         observed = observed_colors(points, train.cameras, train.images, train.valid)
         if seeds is not None:
             observed = np.concatenate([observed, seeds.colors])
-        reflectance = (observed / law.gain) ** (1 / law.exponent)
+        reflectance = law.undone(observed)
     gains = None
     if config.model.exposure == "drifting":
         gains = exposures(points, train.cameras, train.images, train.valid)

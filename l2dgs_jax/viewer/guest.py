@@ -110,7 +110,8 @@ class Guest:
 
     def _send(self, shown: Shown) -> None:
         panel = self._panel
-        image = picture(shown.output, panel.kind, panel.light, panel.curtain, self._ranges)
+        cfg = self._renderers.run.config.model
+        image = picture(shown.output, cfg, panel.kind, panel.light, panel.curtain, self._ranges)
         depth = hiding_depth(shown.output, self._stage.unit) if self._frusta else None
         self._client.scene.set_background_image(image, format="jpeg", jpeg_quality=QUALITY, depth=depth)
         self._client.flush()

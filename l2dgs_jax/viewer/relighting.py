@@ -1,5 +1,6 @@
 """A decomposed view put together again in another light: what the low-light image is made by (Eq. 9), with a slider."""
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -7,8 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from l2dgs_jax.config import ModelConfig
 from l2dgs_jax.data.color import linear_to_srgb, srgb_to_linear
-from l2dgs_jax.model.decomposition import power
+from l2dgs_jax.model.decomposition import as_light, full_light, power, product
 from l2dgs_jax.types import Decomposition
 
 LUMINANCE: Float[np.ndarray, "3"] = np.array([0.2126, 0.7152, 0.0722])  # of linear red, green and blue (Rec. 709)
@@ -34,20 +36,22 @@ class Light(NamedTuple):
     tint: Any = 0.0
 
 
-@jax.jit
-def relit(images: Decomposition, light: Light) -> Float[Array, "H W 3"]:
+@partial(jax.jit, static_argnames="cfg")
+def relit(images: Decomposition, light: Light, cfg: ModelConfig) -> Float[Array, "H W 3"]:
     """(L^(shading B2^d) R^(B1^d)) with d = 1 - brightness, its white balanced and multiplied in linear light.
 
     Args:
         images: of a view.
         light: how it is lit.
+        cfg: shape of the scene: what is raised to powers, and which L is full light.
 
     Returns:
         sRGB values in [0, 1].
     """
     exponents = images.attenuation ** (1 - light.brightness)
-    illumination = power(images.illumination, light.shading * exponents[..., 1])
-    image = illumination[..., None] * power(images.reflectance, exponents[..., :1])
+    full = full_light(cfg) ** (-light.shading * light.brightness)
+    illumination = full * power(images.illumination, light.shading * exponents[..., 1])
+    image = product(illumination, power(as_light(images.reflectance, cfg), exponents[..., :1]), cfg)
     gains = white_balance(light.warmth, light.tint) * 2.0**light.gain
     return linear_to_srgb(jnp.clip(srgb_to_linear(image) * gains[None, None].astype(image.dtype), 0, 1))
 

@@ -56,7 +56,12 @@ def test_what_the_program_does_not_render_is_not_exported(run, part):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "variant", [{}, {"aggregation": "product", "box_rim": 0.2}, {"background": 0.7, "moving_share": 0.4}]
+    "variant",
+    [
+        {},
+        {"aggregation": "product", "box_rim": 0.2, "domain": "values", "relative_light": False},
+        {"background": 0.7, "moving_share": 0.4, "domain": "light", "relative_light": True},
+    ],
 )
 def test_the_documented_program_renders_the_model(run, variant, tmp_path, monkeypatch):
     rng = np.random.default_rng(0)

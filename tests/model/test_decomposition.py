@@ -7,6 +7,7 @@ import pytest
 from jax.test_util import check_grads
 
 from l2dgs_jax.config import ModelConfig
+from l2dgs_jax.data.color import linear_to_srgb, srgb_to_linear
 from l2dgs_jax.model.decomposition import clip_unit, decompose, power
 from l2dgs_jax.model.networks import apply_bafe
 from l2dgs_jax.types import BAFENet, Conv, GroupNorm
@@ -61,6 +62,34 @@ def test_images_follow_eqs_5_to_9():
             np.testing.assert_allclose(images.reflectance[pixel], reflectance, rtol=1e-12)
             np.testing.assert_allclose(images.welllit[pixel], illumination * reflectance, rtol=1e-12)
             np.testing.assert_allclose(images.lowlight[pixel], illumination**b2 * reflectance**b1, rtol=1e-9)
+
+
+LIGHT = ModelConfig(domain="light", relative_light=True, initial_illumination=0.7)
+
+
+def test_in_the_domain_of_light_eqs_7_and_9_are_of_the_light_that_values_stand_for():
+    features = make_features(2, 4, 5, low=0.05, high=1.5)
+    images = jax.tree.map(np.asarray, decompose(features, make_bafe(), LIGHT))
+    light, color = images.illumination[..., None], srgb_to_linear(images.reflectance)
+    b1, b2 = images.attenuation[..., :1], images.attenuation[..., 1:]
+    bright = light / 0.7 * color
+    np.testing.assert_allclose(images.welllit, linear_to_srgb(np.minimum(bright, 1)), rtol=1e-9)
+    np.testing.assert_allclose(images.lowlight, linear_to_srgb(light**b2 * color**b1), rtol=1e-9)
+    assert (bright > 1).any()
+
+
+def test_what_it_starts_from_is_full_light():
+    features = make_features(2, 4, 5).at[..., 0].set(0.7)
+    images = decompose(features, make_bafe(), LIGHT)
+    np.testing.assert_allclose(images.welllit, images.reflectance, rtol=1e-9)
+
+
+def test_gradients_of_the_images_in_the_domain_of_light():
+    # Dim light: what lies beyond 1 has no gradient.
+    features, bafe = make_features(2, 4, 5).at[..., 0].multiply(0.7), make_bafe()
+    check_grads(jax.jit(partial(decompose, cfg=LIGHT)), (features, bafe), 1, ("rev",), 1e-5, 1e-5, eps=1e-6)
+    black = jnp.zeros((1, 4, 5, 6))
+    assert all_finite(jax.grad(lambda x: sum(i.sum() for i in decompose(x, bafe, LIGHT)))(black))
 
 
 def test_the_low_light_image_is_never_brighter():

@@ -24,7 +24,7 @@ def test_transfer_functions_are_inverse_and_agree_with_scikit_image():
 def test_it_describes_an_underexposed_image(exposure):
     lit = np.random.default_rng(0).beta(2, 2.3, 10_000)
     dark = linear_to_srgb(exposure * srgb_to_linear(lit))
-    exponent, gain = darkening(dark.mean(), lit.mean())
+    exponent, gain, _ = darkening(dark.mean(), lit.mean())
     law = gain * lit**exponent
     # A gain alone is the law that the exponent must beat.
     gain_only = lit * (dark @ lit) / (lit @ lit)
@@ -44,9 +44,19 @@ def test_a_bright_image_is_left_almost_as_it_is():
 
 
 def test_a_gain_is_a_law_of_the_least_exponent():
-    exponent, gain = darkening(0.07, 0.46, "gain")
+    exponent, gain, _ = darkening(0.07, 0.46, "gain")
     assert exponent == pytest.approx(1.01)
     assert gain * 0.46**exponent == pytest.approx(0.07)
+
+
+def test_of_light_it_is_nearly_a_gain_and_can_be_undone():
+    law = darkening(0.07, 0.46, of_light=True)
+    assert law.exponent == pytest.approx(1.01)
+    values = np.linspace(0, 1, 11)
+    light = law.gain * srgb_to_linear(values) ** law.exponent
+    np.testing.assert_allclose(law.undone(linear_to_srgb(light)), values, atol=1e-6)
+    dark, lit = srgb_to_linear(np.array([0.07, 0.46]))
+    assert law.gain * lit**law.exponent == pytest.approx(dark)
 
 
 @pytest.mark.parametrize("exponent", [1.2, 1.9])

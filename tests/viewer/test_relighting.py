@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from l2dgs_jax.data.color import srgb_to_linear
+from l2dgs_jax.config import ModelConfig
+from l2dgs_jax.data.color import linear_to_srgb, srgb_to_linear
 from l2dgs_jax.types import Decomposition
 from l2dgs_jax.viewer.relighting import LUMINANCE, Light, relit, white_balance
 
@@ -25,8 +26,17 @@ def images():
     return jax.tree.map(jnp.asarray, Decomposition(light[..., None] * colour, dark, light, colour, exponents))
 
 
-def changed(images: Decomposition, **light: float) -> np.ndarray:
-    return np.asarray(relit(images, Light(**light)))
+def changed(images: Decomposition, cfg: ModelConfig = ModelConfig(), **light: float) -> np.ndarray:  # noqa: B008
+    return np.asarray(relit(images, Light(**light), cfg))
+
+
+def test_both_images_are_met_in_the_domain_of_light(images):
+    cfg = ModelConfig(domain="light", relative_light=True, initial_illumination=0.95)
+    light, colour, exponents = images.illumination[..., None], srgb_to_linear(images.reflectance), images.attenuation
+    welllit = linear_to_srgb(light / 0.95 * colour)
+    lowlight = linear_to_srgb(light ** exponents[..., 1:] * colour ** exponents[..., :1])
+    np.testing.assert_allclose(changed(images, cfg), welllit, atol=2e-4)
+    np.testing.assert_allclose(changed(images, cfg, brightness=0.0), lowlight, atol=2e-4)
 
 
 def test_as_it_stands_it_is_the_well_lit_image(images):
