@@ -60,6 +60,8 @@ def _presets() -> dict[str, Config]:
             initial_illumination="auto",
             initial_opacity=0.3,
             tone="auto",
+            domain="auto",  # with values, B1 would have to do what the sRGB curve does
+            relative_light=True,
             exposure="auto",
         ),
         loss=LossConfig(

@@ -159,7 +159,10 @@ def near_plane(run: Run) -> float:
 def background(run: Run) -> float:
     """What the colours are to be blended over, sRGB: the well-lit image where nothing is drawn."""
     model = run.config.model
-    return model.background**2 if model.decomposition == "retinex" else model.background  # Eq. 7: L R
+    if model.decomposition != "retinex":
+        return model.background
+    color = as_light(jnp.full(3, model.background, float), model)
+    return float(product(jnp.asarray(model.background / full_light(model), float), color, model)[0])
 
 
 def _exact(renderer: Renderer, cameras: Camera, kinds: tuple[Image, ...]) -> Float[Array, "V H W C"]:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from l2dgs_jax import rasterize
+from l2dgs_jax.data.color import linear_to_srgb, srgb_to_linear
 from l2dgs_jax.exporters import baking, ply
 from l2dgs_jax.exporters.splats import visible
 
@@ -121,9 +122,21 @@ def test_a_background_is_left_to_the_viewer(run):
     assert jnp.abs(drawn.features + 0.64 * (1 - drawn.alpha[..., None]) - exact).mean() < 0.04
 
 
-@pytest.mark.parametrize(("decomposition", "expected"), [("retinex", 0.64), ("none", 0.8), ("curve", 0.8)])
-def test_the_background_is_the_well_lit_image_of_nothing(run, decomposition, expected):
-    model = dataclasses.replace(run.config.model, background=0.8, decomposition=decomposition)
+LIGHT = {"domain": "light", "relative_light": True, "initial_illumination": 0.9}
+VALUES = {"domain": "values", "relative_light": False}
+
+
+@pytest.mark.parametrize(
+    ("settings", "expected"),
+    [
+        (VALUES, 0.64),
+        (LIGHT, linear_to_srgb(0.8 / 0.9 * srgb_to_linear(np.full(1, 0.8)))[0]),
+        ({"decomposition": "none"}, 0.8),
+        ({"decomposition": "curve"}, 0.8),
+    ],
+)
+def test_the_background_is_the_well_lit_image_of_nothing(run, settings, expected):
+    model = dataclasses.replace(run.config.model, background=0.8, **settings)
     bare = dataclasses.replace(run, config=dataclasses.replace(run.config, model=model))
     assert baking.background(bare) == pytest.approx(expected)
     nothing = run.state.scene._replace(alive=jnp.zeros_like(run.state.scene.alive))

@@ -8,6 +8,7 @@ import pytest
 from fake_browser import Client
 from scenes import write_nerfies
 
+from l2dgs_jax.config import Config
 from l2dgs_jax.data import load_dataset
 from l2dgs_jax.runs.pictures import Output
 from l2dgs_jax.types import Decomposition, RenderOutput
@@ -26,7 +27,7 @@ class Pretended(Renderers):
 
     def __init__(self, sizes):
         self.seconds, self.asked, self.ordered = dict.fromkeys(sizes, 0.02), [], []
-        self.run = SimpleNamespace(state=SimpleNamespace(step=7))
+        self.run = SimpleNamespace(state=SimpleNamespace(step=7), config=Config())
 
     def order(self, sizes):
         self.ordered = list(sizes)
