@@ -33,7 +33,7 @@ def test_expected_depth_divides_by_alpha_and_is_zero_where_nothing_is():
 def test_the_background_is_seen_in_illumination_and_reflectance_where_nothing_is_drawn(base, background):
     run = finished_run.opened(base)
     empty = run.state.scene._replace(alive=np.zeros_like(run.state.scene.alive))
-    cfg = dataclasses.replace(run.config.model, background=background)
+    cfg = dataclasses.replace(run.config.model, background=background, domain="values", relative_light=False)
     width, height = run.dataset.width, run.dataset.height
     renderer = Renderer(empty, cfg, width, height, moving=True, sh_degree=1)
     images = renderer(select_camera(run.dataset.test.cameras, 0)).images
