@@ -16,7 +16,7 @@ import numpy as np
 from experiments.benchmarks.native import NativeBlend
 from experiments.benchmarks.scenes import cloud, fine_state, training, video
 from experiments.benchmarks.stopwatch import best_of, peak_memory, resident_memory
-from l2dgs_jax.config import PRESETS, Config
+from l2dgs_jax.config import PRESETS, Config, overrides
 from l2dgs_jax.config.overrides import StaticConfig
 from l2dgs_jax.model import channels, hexplane, networks
 from l2dgs_jax.model.decomposition import decompose
@@ -41,11 +41,11 @@ CONFIG = dataclasses.replace(
     ),
     density=dataclasses.replace(DEFAULT.density, stop=0),
 )
-TENTH = dataclasses.replace(CONFIG, model=dataclasses.replace(CONFIG.model, moving_share=0.1))  # of them moves
+TENTH = overrides.replace(CONFIG, {"model.moving_share": 0.1})  # of them moves
 VARIANTS = {
     "tenth_moving": TENTH,
-    "without_paths": dataclasses.replace(CONFIG, model=dataclasses.replace(CONFIG.model, tracks=False)),
-    "without_gates": dataclasses.replace(CONFIG, model=dataclasses.replace(CONFIG.model, motion_gate=False)),
+    "without_paths": overrides.replace(CONFIG, {"model.tracks": False}),
+    "without_gates": overrides.replace(CONFIG, {"model.motion_gate": False}),
 }
 SIZES = {"10k_160x96": (10_000, 160, 96), "50k_480x270": (50_000, 480, 270), "50k_800x450": (50_000, 800, 450)}
 STEPS = {"10k_200x112": (10_000, 200, 112), "40k_400x225": (40_000, 400, 225), "50k_800x450": (50_000, 800, 450)}

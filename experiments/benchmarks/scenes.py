@@ -1,13 +1,12 @@
 """Scenes of any size to measure on: random clouds that fill the view, as the golden tests use, and whole models."""
 
-import dataclasses
 from functools import partial
 
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import logit
 
-from l2dgs_jax.config import Config
+from l2dgs_jax.config import Config, overrides
 from l2dgs_jax.data.dataset import Dataset, Split
 from l2dgs_jax.data.stacks import stacked
 from l2dgs_jax.model.initialisation import pad_rows, path_knots
@@ -71,9 +70,7 @@ def fine_state(dataset: Dataset, config: Config) -> TrainState:
     count, frames = len(dataset.points), len(dataset.train.names)
     arrays = cloud(count, dataset.width, dataset.height)
     # Tracks found in noise would add Gaussians.
-    scene = initial_state(
-        dataset, dataclasses.replace(config, model=dataclasses.replace(config.model, tracks=False))
-    ).scene
+    scene = initial_state(dataset, overrides.replace(config, {"model.tracks": False})).scene
     rows = partial(pad_rows, capacity=len(scene.alive))
     gaussians = scene.params.gaussians._replace(
         quats=rows(jnp.asarray(arrays["quats"])),

@@ -78,7 +78,7 @@ def _score(scores: Any, path: Sequence[str]) -> float | None:
 
 def markdown(found: Found) -> str:
     """One table a scene, with a row for each combination of settings; or the other way round if that is only one."""
-    scenes = list(dict.fromkeys(scene for rows in found.values() for scene in rows))
+    scenes = _scenes(found)
     if len(found) == 1:
         ((row, rows),) = found.items()
         return _table(_label(row), rows)
@@ -88,10 +88,14 @@ def markdown(found: Found) -> str:
 
 def brief(found: Found) -> str:
     """One table with a row for each combination of settings and a column for each scene."""
-    scenes = list(dict.fromkeys(scene for rows in found.values() for scene in rows))
+    scenes = _scenes(found)
     lines = [["low, gain / SSIM", *scenes], ["---"] * (len(scenes) + 1)]
     lines += ([_label(row), *(_brief_cell(rows.get(scene)) for scene in scenes)] for row, rows in found.items())
     return _lines(lines)
+
+
+def _scenes(found: Found) -> list[str]:
+    return list(dict.fromkeys(scene for rows in found.values() for scene in rows))
 
 
 def _brief_cell(scores: dict[str, list[float]] | None) -> str:

@@ -42,11 +42,12 @@ def decompose(features: Float[Array, "*B H W 6"], bafe: BAFENet, cfg: ModelConfi
     attenuation = apply_bafe(bafe, attenuation) if cfg.bafe else bounded_exponents(bafe, attenuation)
     if cfg.unit_exponent is not None:
         attenuation = attenuation.at[..., ("b1", "b2").index(cfg.unit_exponent)].set(1)
+    color = as_light(reflectance, cfg)
     return Decomposition(
-        welllit=product(illumination / full_light(cfg), as_light(reflectance, cfg), cfg),
+        welllit=product(illumination / full_light(cfg), color, cfg),
         lowlight=product(
             power(illumination, attenuation[..., 1]),
-            power(as_light(reflectance, cfg), repeat_channels(attenuation[..., 0], 3)),
+            power(color, repeat_channels(attenuation[..., 0], 3)),
             cfg,
         ),
         illumination=illumination,

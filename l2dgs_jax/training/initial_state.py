@@ -6,12 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from l2dgs_jax.config import Config, overrides
+from l2dgs_jax.config import Config, ModelConfig, overrides
 from l2dgs_jax.data.dataset import Dataset, Split
 from l2dgs_jax.model import networks
 from l2dgs_jax.model.initialisation import initialise, scene_shapes, z_order
 from l2dgs_jax.model.observation import exposures, observed_colors
-from l2dgs_jax.model.tone import Darkening, darkening, recognise
+from l2dgs_jax.model.tone import Darkening, Tone, darkening, recognise
 from l2dgs_jax.model.tone_curves import equalising_law, power_law
 from l2dgs_jax.runtime.capacity import next_capacity
 from l2dgs_jax.training.seeds import find_seeds
@@ -32,10 +32,12 @@ def split_darkening(split: Split, config: Config) -> Darkening:
         return Darkening(1.0, 1.0)
     if config.model.decomposition == "curve":
         return equalising_law(split.images, split.valid)
-    tone, level = config.model.tone, float(config.loss.exposure_level)
-    if tone == "auto":
-        tone = recognise(split.images, split.valid)
-    return darkening(split.mean_level, level, tone, of_light=config.model.domain == "light")
+    level, of_light = float(config.loss.exposure_level), config.model.domain == "light"
+    return darkening(split.mean_level, level, _tone(split, config.model), of_light=of_light)
+
+
+def _tone(split: Split, cfg: ModelConfig) -> Tone | float:
+    return recognise(split.images, split.valid) if cfg.tone == "auto" else cfg.tone
 
 
 def resolve(config: Config, dataset: Dataset) -> Config:
@@ -48,8 +50,8 @@ def resolve(config: Config, dataset: Dataset) -> Config:
         config = overrides.replace(config, {"model.exposure": "drifting" if drift else "steady"})
     model = config.model
     if model.domain == "auto":
-        tone = recognise(split.images, split.valid) if model.tone == "auto" else model.tone
-        model = dataclasses.replace(model, domain="light" if tone == "linear-light" else "values")
+        of_light = _tone(split, model) == "linear-light"
+        model = dataclasses.replace(model, domain="light" if of_light else "values")
     config = dataclasses.replace(config, model=model)
     if "auto" not in (*(model.initial_exponents or ()), model.initial_illumination):
         return config
