@@ -34,12 +34,16 @@ Figures = dict[str, float]
 
 DEFAULT = PRESETS["default"]
 # What `training.resolve` would take from the frames; it costs the same whatever they are.
-CONFIG = dataclasses.replace(
+CONFIG = overrides.replace(
     DEFAULT,
-    model=dataclasses.replace(
-        DEFAULT.model, initial_exponents=(2.0, 9.0), initial_illumination=0.9, tone=2.0, exposure="steady"
-    ),
-    density=dataclasses.replace(DEFAULT.density, stop=0),
+    {
+        "model.initial_exponents": (1.01, 9.0),
+        "model.initial_illumination": 0.7,
+        "model.domain": "light",
+        "model.exposure": "steady",
+        "loss.exposure_level": 0.46,
+        "density.stop": 0,
+    },
 )
 TENTH = overrides.replace(CONFIG, {"model.moving_share": 0.1})  # of them moves
 VARIANTS = {

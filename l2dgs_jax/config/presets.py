@@ -66,7 +66,7 @@ def _presets() -> dict[str, Config]:
         ),
         loss=LossConfig(
             exposure=1.0,
-            exposure_level=0.46,  # photographers' middle grey, 18 % linear, in sRGB
+            exposure_level="auto",
             exposure_of="welllit",
             exposure_window=None,
             exposure_form="squared",

@@ -32,6 +32,7 @@ _PLAIN_NUMBER, _PLAIN_COUNT, _PLAIN_LENGTH = float, int, int | None
 _PLAIN_EXPONENTS = tuple[float | Literal["auto"], float] | None
 _PLAIN_MOST = int | Literal["auto"]
 _PLAIN_ILLUMINATION = float | Literal["auto"] | None
+_PLAIN_LEVEL = float | Literal["auto"]
 _PLAIN_OPTIONAL = float | None
 Number = Annotated[_Float, _arg(_PLAIN_NUMBER)]
 Count = Annotated[_Int, _arg(_PLAIN_COUNT)]
@@ -39,6 +40,7 @@ Length = Annotated[_Int | None, _arg(_PLAIN_LENGTH)]
 Exponents = Annotated[tuple[_Float | Literal["auto"], _Float] | None, _arg(_PLAIN_EXPONENTS)]
 Most = Annotated[_Int | Literal["auto"], _arg(_PLAIN_MOST)]
 Illumination = Annotated[_Float | Literal["auto"] | None, _arg(_PLAIN_ILLUMINATION)]
+Level = Annotated[_Float | Literal["auto"], _arg(_PLAIN_LEVEL)]
 OptionalNumber = Annotated[_Float | None, _arg(_PLAIN_OPTIONAL)]
 TRACEABLE: dict[Any, Any] = {
     Number: _PLAIN_NUMBER,
@@ -47,6 +49,7 @@ TRACEABLE: dict[Any, Any] = {
     Exponents: _PLAIN_EXPONENTS,
     Most: _PLAIN_MOST,
     Illumination: _PLAIN_ILLUMINATION,
+    Level: _PLAIN_LEVEL,
     OptionalNumber: _PLAIN_OPTIONAL,
 }
 
@@ -145,7 +148,9 @@ class LossConfig:
     eta_end: Number = 0.5  # the same at the end
     eta_restarts: bool = False  # the decay starts anew with the fine stage
     exposure: Number = 0.01  # lambda_1, Eq. 11
-    exposure_level: Number = 0.6  # mean brightness that Eq. 11 asks for, sRGB: the knob for a brighter or darker result
+    # Mean brightness that Eq. 11 asks for, sRGB: the knob for a brighter or darker result. "auto": mid-grey, or what
+    # keeps highlights from clipping (model/tone.py)
+    exposure_level: Level = 0.6
     exposure_of: Literal["reflectance", "welllit"] = "reflectance"  # the image whose brightness that is
     exposure_window: int | None = 16  # pixels; None: the mean of the whole image
     exposure_form: Literal["absolute", "squared"] = "absolute"  # what the difference counts as

@@ -1,5 +1,6 @@
-"""What underexposure does to an sRGB image: where B1 and L_w start."""
+"""What underexposure does to an sRGB image: where B1 and L_w start, and how bright the result is to be."""
 
+from collections.abc import Iterator
 from typing import Literal, NamedTuple
 
 import cv2
@@ -17,6 +18,10 @@ CLEAN, FLAT = 1 / 255, 0.5
 SMOOTHEST = 0.1  # share of the windows
 WINDOW = 7  # pixels
 LOOKED_AT = 12  # frames
+MID_GREY = 0.46  # photographers' middle grey, 18 % linear, in sRGB
+# Highlights, which all but some of the pixels stay below, shall stay below a value themselves. A lamp in view must not
+# leave all else in the dark: the level gives way by no more than a stop.
+HIGHLIGHTS, BRIGHTEST, MOST_GIVEN_WAY = 0.98, 0.9, 0.5
 
 
 class Darkening(NamedTuple):
@@ -62,6 +67,24 @@ def darkening(
     return Darkening(exponent, min(dark_level / lit_level**exponent, 1.0))
 
 
+def lit_level(
+    images: Float[np.ndarray, "F H W 3"], valid: Bool[np.ndarray, "F H W"] | None, dark_level: float, *, of_light: bool
+) -> float:
+    """The mean sRGB value to bring dark frames to: mid-grey, or less where that would clip their highlights.
+
+    Args:
+        images: sRGB values in [0, 1].
+        valid: which pixels count; None for all.
+        dark_level: mean of `images`, in (0, 1).
+        of_light: whether a factor on light is looked for, or one on sRGB values.
+    """
+    brightest = np.concatenate([image.max(-1)[counted] for image, counted in _looked_at(images, valid)])
+    known = np.array([dark_level, MID_GREY, np.quantile(brightest, HIGHLIGHTS), BRIGHTEST])
+    dark, grey, highlights, most = srgb_to_linear(known) if of_light else known
+    level = np.asarray(grey * np.clip(most / (highlights * grey / dark), MOST_GIVEN_WAY, 1.0))
+    return float(linear_to_srgb(level) if of_light else level)
+
+
 def recognise(images: Float[np.ndarray, "F H W 3"], valid: Bool[np.ndarray, "F H W"] | None = None) -> Tone:
     """How dark frames became dark, as far as they tell.
 
@@ -74,14 +97,20 @@ def recognise(images: Float[np.ndarray, "F H W 3"], valid: Bool[np.ndarray, "F H
         valid: which pixels count; None for all.
     """
     noise, levels = [], []
-    for index in np.unique(np.linspace(0, len(images) - 1, LOOKED_AT).round().astype(int)):
-        image = images[index].astype(np.float32)
-        counted = np.ones(image.shape[:2], bool) if valid is None else valid[index]
+    for image, counted in _looked_at(images, valid):
         noise.append(_roughness(image)[counted])
         levels.append(image.mean(-1)[counted])
     clean = np.quantile(np.concatenate(noise), SMOOTHEST) < CLEAN
     flat = np.log(np.maximum(np.concatenate(levels), 0.5 / 255)).std() < FLAT
     return "gain" if clean and flat else "linear-light"
+
+
+def _looked_at(
+    images: Float[np.ndarray, "F H W 3"], valid: Bool[np.ndarray, "F H W"] | None
+) -> Iterator[tuple[Float[np.ndarray, "H W 3"], Bool[np.ndarray, "H W"]]]:
+    for index in np.unique(np.linspace(0, len(images) - 1, LOOKED_AT).round().astype(int)):
+        image = images[index].astype(np.float32)
+        yield image, np.ones(image.shape[:2], bool) if valid is None else valid[index]
 
 
 def _roughness(image: Float[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H W"]:

@@ -11,7 +11,7 @@ from l2dgs_jax.data.dataset import Dataset, Split
 from l2dgs_jax.model import networks
 from l2dgs_jax.model.initialisation import initialise, scene_shapes, z_order
 from l2dgs_jax.model.observation import exposures, observed_colors
-from l2dgs_jax.model.tone import Darkening, Tone, darkening, recognise
+from l2dgs_jax.model.tone import Darkening, Tone, darkening, lit_level, recognise
 from l2dgs_jax.model.tone_curves import equalising_law, power_law
 from l2dgs_jax.runtime.capacity import next_capacity
 from l2dgs_jax.training.seeds import find_seeds
@@ -53,6 +53,9 @@ def resolve(config: Config, dataset: Dataset) -> Config:
         of_light = _tone(split, model) == "linear-light"
         model = dataclasses.replace(model, domain="light" if of_light else "values")
     config = dataclasses.replace(config, model=model)
+    if config.loss.exposure_level == "auto":
+        level = lit_level(split.images, split.valid, split.mean_level, of_light=model.domain == "light")
+        config = overrides.replace(config, {"loss.exposure_level": round(level, 3)})
     if "auto" not in (*(model.initial_exponents or ()), model.initial_illumination):
         return config
     exponent, gain, _ = split_darkening(split, config)

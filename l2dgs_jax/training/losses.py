@@ -44,6 +44,7 @@ def total(
     exposed = images.reflectance if cfg.exposure_of == "reflectance" else images.welllit
     illumination = images.illumination[..., None]
     b1, b2 = images.attenuation[..., :1], images.attenuation[..., 1:]
+    level: Scalar | float = cfg.exposure_level  # type: ignore[assignment]  # "auto" is resolved
     lambda4 = cfg.structure if cfg.structure_illumination is None else cfg.structure_illumination
     beta2 = cfg.structure_beta if cfg.structure_beta_illumination is None else cfg.structure_beta_illumination
     terms: Terms = {
@@ -51,7 +52,7 @@ def total(
         "ssim": (cfg.ssim, lambda: photometric_ssim(images.lowlight, target, eta, cfg.eps)),
         "exposure": (
             cfg.exposure,
-            lambda: exposure(exposed, cfg.exposure_level, cfg.exposure_window, cfg.exposure_form),
+            lambda: exposure(exposed, level, cfg.exposure_window, cfg.exposure_form),
         ),
         "amplification": (cfg.amplification, lambda: amplification(images.illumination)),
         "reflectance_amplification": (cfg.reflectance_amplification, lambda: amplification(images.reflectance)),

@@ -78,6 +78,11 @@ def whole(start, tmp_path_factory):
     return folder
 
 
+def same_scores(expected):
+    # Where an image is just about to clip, rounding decides whether a pixel has a gradient; so a few parts in 1,000.
+    return pytest.approx(expected["scores"]["lowlight"], 5e-3, 1e-5)
+
+
 def results(folder):
     return {member["name"]: member for member in json.loads((folder / report.JSON).read_text())["members"]}
 
@@ -87,7 +92,7 @@ def assert_same_results(folder, whole):
     assert list(found) == list(expected) == NAMES
     for name in NAMES:
         assert found[name]["ended"] == expected[name]["ended"] == "finished"
-        assert found[name]["scores"]["lowlight"] == pytest.approx(expected[name]["scores"]["lowlight"], 1e-3, 1e-5)
+        assert found[name]["scores"]["lowlight"] == same_scores(expected[name])
         steps = [json.loads(line)["step"] for line in (folder / name / runs.METRICS).read_text().splitlines()]
         assert steps == [10, 12]
 
@@ -172,6 +177,6 @@ def test_a_member_that_diverges_is_frozen_and_reported(start, whole, study, tmp_
     assert [member["ended"].split(" at ")[0] for member in found.values()] == ["finished", "finished", "diverged"] * 2
     for name, expected in results(whole).items():
         same = next(member for key, member in found.items() if key[3:] == name[3:])
-        assert same["scores"]["lowlight"] == pytest.approx(expected["scores"]["lowlight"], 1e-3, 1e-5)
+        assert same["scores"]["lowlight"] == same_scores(expected)
     frozen = next(folder for folder in (tmp_path / "out").glob("*wild"))
     assert json.loads((frozen / running.DIVERGED).read_text())["step"] == int(runs.open_run(frozen).state.step)

@@ -8,7 +8,7 @@ from skimage.color import rgb2xyz, xyz2rgb
 from skimage.transform import resize
 
 from l2dgs_jax.data.color import linear_to_srgb, srgb_to_linear
-from l2dgs_jax.model.tone import darkening, recognise
+from l2dgs_jax.model.tone import darkening, lit_level, recognise
 
 
 def test_transfer_functions_are_inverse_and_agree_with_scikit_image():
@@ -98,3 +98,31 @@ def test_only_pixels_that_count_tell():
     assert recognise(frames, valid) == "linear-light"
     valid[:, :, 56:] = False
     assert recognise(frames, valid) == "gain"
+
+
+def lit(frames, of_light=True, valid=None):
+    return lit_level(frames, valid, frames.mean(), of_light=of_light)
+
+
+@pytest.mark.parametrize("of_light", [True, False])
+def test_frames_without_highlights_come_to_mid_grey(of_light):
+    frames = 0.2 * photographs(contrast=0.2)
+    assert lit(frames, of_light) == pytest.approx(0.46)
+
+
+def test_the_level_gives_way_for_highlights():
+    frames = linear_to_srgb(0.05 * srgb_to_linear(photographs(contrast=0.6)))
+    level = lit(frames)
+    assert 0.34 < level < 0.45
+    undone = darkening(frames.mean(), level, of_light=True).undone(frames)
+    assert np.quantile(undone.max(-1), 0.98) == pytest.approx(0.9, abs=0.01)
+
+
+def test_the_level_gives_way_by_a_stop_at_most():
+    frames = 0.1 * photographs(contrast=0.4)
+    frames[:, :24, :24] = 1.0
+    level = lit(frames)
+    assert srgb_to_linear(np.array(level)) == pytest.approx(srgb_to_linear(np.array(0.46)) / 2, rel=1e-4)
+    valid = np.ones(frames.shape[:3], bool)
+    valid[:, :24, :24] = False
+    assert lit_level(frames, valid, frames[valid].mean(), of_light=True) > 0.44
