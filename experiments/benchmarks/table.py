@@ -31,7 +31,7 @@ TABLES = {
         "its parts on one device: HexPlane": "parts hexplane_ms",
         "heads and OCD-Net": "parts heads_and_ocd_ms",
         "rasterizer": "parts rasterizer_ms",
-        "BAFE-Net": "parts bafe_ms",
+        "BAFE-Net, in presets that have it": "parts bafe_ms",
         "Adam": "parts adam_ms",
         "rendering well-lit frames": "rendering welllit_frames_per_s",
         "the motion field acting on a tenth of the Gaussians": "rendering tenth_moving_welllit_frames_per_s",

@@ -63,6 +63,7 @@ def _presets() -> dict[str, Config]:
             domain="auto",  # with values, B1 would have to do what the sRGB curve does
             relative_light=True,
             exposure="auto",
+            bafe=False,  # of light, one gain explains a dark frame
         ),
         loss=LossConfig(
             exposure=1.0,

@@ -13,7 +13,7 @@ from l2dgs_jax.model.deformation import acting, length_unit
 from l2dgs_jax.rasterizer.projection import NEAR_PLANE
 from l2dgs_jax.runs import Run
 
-WHOLE = {"decomposition": "retinex", "ocd": True, "bafe": True, "unit_exponent": None}  # settings of a model
+WHOLE = {"decomposition": "retinex", "ocd": True, "unit_exponent": None}  # settings of a model
 
 
 def model_arrays(run: Run) -> dict[str, Shaped[np.ndarray, "..."]]:
@@ -39,7 +39,7 @@ def model_arrays(run: Run) -> dict[str, Shaped[np.ndarray, "..."]]:
         "hexplane": params.hexplane,
         "heads": params.heads,
         "ocd": params.ocd,
-        "bafe": params.bafe,
+        "bafe": params.bafe if cfg.bafe else {"out": {"bias": params.bafe.out.bias}},
         "bounds": scene.bounds,
         "length_unit": unit,
         "near_plane": NEAR_PLANE * unit,

@@ -101,7 +101,7 @@ class Renderer:
         return output._replace(images=images, alpha=output.alpha[0], depth=output.depth[0], radii=output.radii[0])
 
     def welllit(self, camera: Camera) -> Float[Array, "H W 3"]:
-        """Only I_w of one camera: without the low-light image, BAFE-Net need not run."""
+        """Only I_w of one camera: without the low-light image, no exponents are needed."""
         return self._fitting(_render_welllit, camera).image[0]
 
     def _fitting(self, draw: Callable[..., Drawn], camera: Camera) -> Drawn:

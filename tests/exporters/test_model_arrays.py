@@ -34,7 +34,7 @@ def test_every_array_is_documented_and_plain(run, tmp_path):
     with np.load(tmp_path / "scene.npz", allow_pickle=False) as model:
         assert [name for name in model if not any(re.fullmatch(pattern, name) for pattern in patterns)] == []
         unused = [pattern for pattern in patterns if not any(re.fullmatch(pattern, name) for name in model)]
-        optional = ("gate", "opacity", "paths", "lifetimes")
+        optional = ("gate", "opacity", "paths", "lifetimes", "bafe/conv", "bafe/norm", "bafe/out/weight")
         assert all(any(name in pattern for name in optional) for pattern in unused)
         assert all(model[name].dtype.kind in "biU" or model[name].dtype == np.float32 for name in model)
 
@@ -47,7 +47,7 @@ def test_dead_gaussians_stay_behind(run):
     np.testing.assert_array_equal(np.delete(before, [0, 5], axis=0), after)
 
 
-@pytest.mark.parametrize("part", [{"decomposition": "none"}, {"ocd": False}, {"bafe": False}, {"unit_exponent": "b1"}])
+@pytest.mark.parametrize("part", [{"decomposition": "none"}, {"ocd": False}, {"unit_exponent": "b1"}])
 def test_what_the_program_does_not_render_is_not_exported(run, part):
     config = dataclasses.replace(run.config, model=dataclasses.replace(run.config.model, **part))
     with pytest.raises(UserError, match=f"model.{next(iter(part))} is"):
@@ -59,7 +59,7 @@ def test_what_the_program_does_not_render_is_not_exported(run, part):
     "variant",
     [
         {},
-        {"aggregation": "product", "box_rim": 0.2, "domain": "values", "relative_light": False},
+        {"aggregation": "product", "box_rim": 0.2, "domain": "values", "relative_light": False, "bafe": True},
         {"background": 0.7, "moving_share": 0.4, "domain": "light", "relative_light": True},
     ],
 )
