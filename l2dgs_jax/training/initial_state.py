@@ -8,6 +8,7 @@ import numpy as np
 
 from l2dgs_jax.config import Config, ModelConfig, overrides
 from l2dgs_jax.data.dataset import Dataset, Split
+from l2dgs_jax.errors import UserError
 from l2dgs_jax.model import networks
 from l2dgs_jax.model.initialisation import initialise, scene_shapes, z_order
 from l2dgs_jax.model.observation import exposures, observed_colors
@@ -41,8 +42,14 @@ def _tone(split: Split, cfg: ModelConfig) -> Tone | float:
 
 
 def resolve(config: Config, dataset: Dataset) -> Config:
-    """The settings with what they leave to the data filled in from points and training frames."""
+    """The settings with what they leave to the data filled in from points and training frames.
+
+    Raises:
+        UserError: the frames are black.
+    """
     split = dataset.train
+    if split.mean_level == 0:
+        raise UserError(f"{dataset.name}: all its training frames are black; expected frames that show something")
     if config.density.max_gaussians == "auto":
         config = overrides.replace(config, {"density.max_gaussians": _most_gaussians(split)})
     if config.model.exposure == "auto":

@@ -54,9 +54,15 @@ def test_a_training_goes_on_from_a_state(dataset, quick):
     assert fit(dataset, config, start=Checkpoint(finished, 2048)).state is finished
 
 
+def test_black_frames_are_refused(dataset):
+    black = dataclasses.replace(dataset.train, images=np.zeros_like(dataset.train.images))
+    with pytest.raises(UserError, match="tiny: all its training frames are black"):
+        resolve(tiny(), dataclasses.replace(dataset, train=black))
+
+
 @pytest.mark.parametrize(("side", "found"), [(50, 1_500), (1_000, 360_000)])
 def test_how_many_gaussians_there_may_be_follows_the_pixels_up_to_a_bound(dataset, side, found):
-    frames = np.zeros((len(dataset.train.names), side, side, 3), np.float16)
+    frames = np.full((len(dataset.train.names), side, side, 3), 0.1, np.float16)
     large = dataclasses.replace(dataset, train=dataclasses.replace(dataset.train, images=frames))
     config = overrides.replace(tiny(), {"density.max_gaussians": "auto"})
     assert resolve(config, large).density.max_gaussians == found
