@@ -11,6 +11,7 @@ from l2dgs_jax.types import RenderOutput
 from l2dgs_jax.visualize.sheet import viridis
 
 COLOURED: tuple[Output, ...] = ("b1", "b2", "depth")
+LEAST_RANGE = 0.01  # of a value; colours for less would show how an exponent that is one number is rounded
 
 Ranges = dict[Output, tuple[float, float]]
 
@@ -18,7 +19,7 @@ Ranges = dict[Output, tuple[float, float]]
 def ranges(outputs: Sequence[RenderOutput]) -> Ranges:
     """From the 2nd to the 98th percentile of some views, for each kind that has colours only by its range."""
     spans = {kind: np.percentile([values(output, kind) for output in outputs], (2, 98)) for kind in COLOURED}
-    return {kind: (float(low), float(high)) for kind, (low, high) in spans.items()}
+    return {kind: (float(low), float(max(high, (1 + LEAST_RANGE) * low))) for kind, (low, high) in spans.items()}
 
 
 def shown(output: RenderOutput, kind: Output, ranges: Ranges) -> UInt8[np.ndarray, "H W 3"]:

@@ -12,6 +12,7 @@ import pytest
 from l2dgs_jax.cameras.geometry import select_camera
 from l2dgs_jax.data import images
 from l2dgs_jax.errors import UserError
+from l2dgs_jax.visualize import display
 from l2dgs_jax.visualize.contact_sheet import COLUMNS, contact_sheet
 from l2dgs_jax.visualize.sheet import CELL_WIDTHS, GAP, STRIP, cell, viridis
 
@@ -21,9 +22,12 @@ def run(tmp_path_factory):
     """A finished run whose exponents differ from pixel to pixel."""
     run = finished_run.opened(tmp_path_factory.getbasetemp())
     rng = np.random.default_rng(0)
-    shake = lambda x: x + jnp.asarray(rng.normal(0, 0.5, x.shape), x.dtype)
     params = run.state.scene.params
-    params = params._replace(bafe=jax.tree.map(shake, params.bafe))
+    shape = params.gaussians.attenuation.shape
+    params = params._replace(
+        gaussians=params.gaussians._replace(attenuation=jnp.asarray(rng.normal(0, 1, shape))),
+        bafe=jax.tree.map(jnp.zeros_like, params.bafe),
+    )
     return dataclasses.replace(run, state=run.state._replace(scene=run.state.scene._replace(params=params)))
 
 
@@ -65,6 +69,14 @@ def test_contact_sheet_shows_every_part_of_the_render(run):
     for heading in range(len(COLUMNS)):
         x = heading * (cell_width + GAP)
         assert sheet[:STRIP, x : x + cell_width].max() > 200
+
+
+def test_an_exponent_that_is_one_number_has_one_colour(run):
+    output = run.renderer()(select_camera(run.dataset.test.cameras, 0))
+    rounded = 1.01 + 1e-6 * np.random.default_rng(0).normal(size=output.images.attenuation.shape)
+    output = output._replace(images=output.images._replace(attenuation=rounded))
+    shown = display.shown(output, "b1", display.ranges([output]))
+    assert len(np.unique(shown.reshape(-1, 3), axis=0)) == 1
 
 
 def test_contact_sheet_without_held_out_views_or_truth_shows_training_views(run):
