@@ -34,9 +34,11 @@ def tiny(preset="default", **changes):
         hidden=8,
         sh_degree=1,
     )
+    level = 0.46 if base.loss.exposure_level == "auto" else base.loss.exposure_level
+    loss = dataclasses.replace(base.loss, exposure_level=level)
     density = DensityConfig(start=1, stop=100, interval=3, grad_threshold=1e-9, max_gaussians=60)
-    few = {"coarse_steps": 4, "fine_steps": 4, "sh_warmup": 3, "inbetweens": 0.0, "density": density, "model": small}
-    return dataclasses.replace(base, **few | changes)
+    few = {"coarse_steps": 4, "fine_steps": 4, "sh_warmup": 3, "inbetweens": 0.0}
+    return dataclasses.replace(base, **few | {"density": density, "loss": loss, "model": small} | changes)
 
 
 def make_dataset(seed=0):
