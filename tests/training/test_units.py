@@ -12,12 +12,12 @@ from l2dgs_jax.training import initial_state
 
 
 def configure(unit, method="mcmc"):
-    """Settings without what makes steps of rounding: Adam on turns of round Gaussians, whose gradient is rounding."""
+    """Settings without what makes steps of rounding: Adam on turns of round Gaussians, and pixels about to clip."""
     config = tiny(coarse_steps=0, fine_steps=8)
     rates = {"means_lr": 1e-2, "heads_lr": 1e-2, "quats_lr": 0.0, "eps": 1e-40}
     return dataclasses.replace(
         config,
-        model=dataclasses.replace(config.model, unit=unit),
+        model=dataclasses.replace(config.model, unit=unit, relative_light=False),
         optim=dataclasses.replace(config.optim, extent_scales=("means",), **rates),
         loss=dataclasses.replace(config.loss, depth=0.1, scale=0.1, opacity=0.1),
         density=dataclasses.replace(config.density, method=method, start=0, interval=2, max_gaussians=40, noise=20.0),
