@@ -27,6 +27,7 @@ def tiny(preset="default", **changes):
         initial_exponents=exponents,
         initial_illumination=illumination,
         exposure="steady",
+        tone="linear-light" if base.model.tone == "auto" else base.model.tone,
         tracks=False,
         plane_size=4,
         plane_scales=(1, 2),

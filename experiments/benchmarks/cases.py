@@ -39,6 +39,7 @@ CONFIG = overrides.replace(
     {
         "model.initial_exponents": (1.01, 9.0),
         "model.initial_illumination": 0.7,
+        "model.tone": "linear-light",
         "model.domain": "light",
         "model.exposure": "steady",
         "loss.exposure_level": 0.46,

@@ -6,13 +6,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from l2dgs_jax.config import Config, ModelConfig, overrides
+from l2dgs_jax.config import Config, overrides
 from l2dgs_jax.data.dataset import Dataset, Split
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.model import networks
 from l2dgs_jax.model.initialisation import initialise, scene_shapes, z_order
 from l2dgs_jax.model.observation import exposures, observed_colors
-from l2dgs_jax.model.tone import Darkening, Tone, darkening, lit_level, recognise
+from l2dgs_jax.model.tone import Darkening, darkening, lit_level, recognise
 from l2dgs_jax.model.tone_curves import equalising_law, power_law
 from l2dgs_jax.runtime.capacity import next_capacity
 from l2dgs_jax.training.seeds import find_seeds
@@ -33,12 +33,9 @@ def split_darkening(split: Split, config: Config) -> Darkening:
         return Darkening(1.0, 1.0)
     if config.model.decomposition == "curve":
         return equalising_law(split.images, split.valid)
-    level, of_light = float(config.loss.exposure_level), config.model.domain == "light"
-    return darkening(split.mean_level, level, _tone(split, config.model), of_light=of_light)
-
-
-def _tone(split: Split, cfg: ModelConfig) -> Tone | float:
-    return recognise(split.images, split.valid) if cfg.tone == "auto" else cfg.tone
+    model, level = config.model, float(config.loss.exposure_level)
+    assert model.tone != "auto", "expected settings that are resolved"
+    return darkening(split.mean_level, level, model.tone, of_light=model.domain == "light")
 
 
 def resolve(config: Config, dataset: Dataset) -> Config:
@@ -55,11 +52,12 @@ def resolve(config: Config, dataset: Dataset) -> Config:
     if config.model.exposure == "auto":
         drift = exposures(dataset.points, split.cameras, split.images, split.valid).std(0).max() > DRIFT
         config = overrides.replace(config, {"model.exposure": "drifting" if drift else "steady"})
+    if config.model.tone == "auto":
+        config = overrides.replace(config, {"model.tone": recognise(split.images, split.valid)})
+    if config.model.domain == "auto":
+        domain = "light" if config.model.tone == "linear-light" else "values"
+        config = overrides.replace(config, {"model.domain": domain})
     model = config.model
-    if model.domain == "auto":
-        of_light = _tone(split, model) == "linear-light"
-        model = dataclasses.replace(model, domain="light" if of_light else "values")
-    config = dataclasses.replace(config, model=model)
     if config.loss.exposure_level == "auto":
         level = lit_level(split.images, split.valid, split.mean_level, of_light=model.domain == "light")
         config = overrides.replace(config, {"loss.exposure_level": round(level, 3)})
