@@ -16,7 +16,7 @@ from experiments.published import MEASURES, REGIONS, Cells
 from l2dgs_jax.config import overrides
 from l2dgs_jax.metrics import Convention, Lpips, Network
 from l2dgs_jax.runs import open_run
-from l2dgs_jax.runs.lpips_weights import load_lpips
+from l2dgs_jax.runs.lpips_weights import find_lpips
 from l2dgs_jax.runs.scores import evaluate
 from l2dgs_jax.runtime import devices
 from l2dgs_jax.runtime.files import replacing, write_json
@@ -39,7 +39,7 @@ class Options:
         output: folder for the study and the table; the same command goes on where it was interrupted.
         study: TOML file to run in place of the one in experiments/studies; the names of its variants are the rows.
         scenes: folders of scenes in place of the study's.
-        lpips_alex: files with the weights of LPIPS, as for `evaluate`; without them its columns stay empty.
+        lpips_alex: files with the weights of LPIPS, as for `evaluate`; without any its columns stay empty.
         quick: a few steps on the first scene, to see that all of it works; its scores mean nothing.
     """
 
@@ -57,7 +57,7 @@ def trained(options: Options, study: str) -> list[Member]:
         UserError: as `run_study`, or weights of LPIPS cannot be read.
     """
     devices.one_per_core()
-    lpips: dict[Network, Lpips] = {"alex": load_lpips("alex", options.lpips_alex)} if options.lpips_alex else {}
+    lpips = find_lpips({"alex": options.lpips_alex})
     scenes = [scene if scene == "demo" else str(Path(scene).absolute()) for scene in options.scenes]
     spec = read(options.study or STUDIES / study, scenes)
     spec = _quick(spec) if options.quick else spec

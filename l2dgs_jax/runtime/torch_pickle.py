@@ -7,7 +7,6 @@ lie beside the pickle in a zip archive, or, before PyTorch 1.6, behind it in the
 import io
 import math
 import pickle
-import pickletools
 import zipfile
 from collections import OrderedDict
 from collections.abc import Sequence
@@ -18,6 +17,7 @@ import numpy as np
 from jaxtyping import Shaped
 
 from l2dgs_jax.errors import UserError
+from l2dgs_jax.runtime.pickles import RefusedError, check_memo, refused
 
 _ZIP_START = b"PK\x03\x04"
 _LEGACY_MAGIC = 0x1950A86A20F9469CFC6C
@@ -59,16 +59,12 @@ def load(path: Path) -> dict[str, Shaped[np.ndarray, "..."]]:
         if not isinstance(saved, dict) or not all(
             isinstance(v, _Tensor) and isinstance(k, str) for k, v in saved.items()
         ):
-            raise _RefusedError("holds something else; expected a dictionary of tensors, as a model's state_dict")
+            raise RefusedError("holds something else; expected a dictionary of tensors, as a model's state_dict")
         return {name: _array(tensor, storages) for name, tensor in saved.items()}
-    except _RefusedError as refusal:
+    except RefusedError as refusal:
         raise UserError(f"{path}: {refusal}") from None
     except Exception:  # damaged archives and pickles raise whatever their bytes lead to
         raise UserError(f"{path}: damaged or of another kind; expected a whole file that torch.save wrote") from None
-
-
-class _RefusedError(Exception):
-    """What a sound file holds that is not supported; the message lacks only the file's name."""
 
 
 class _Storage(NamedTuple):
@@ -100,7 +96,7 @@ class _Unpickler(pickle.Unpickler):
             return self._rebuild_tensor
         if module == "torch" and name in _DTYPES:
             return _DTYPES[name]
-        raise _RefusedError(f"asks to load {f'{module}.{name}'[:80]!r}; expected plain tensors only (nothing was run)")
+        raise refused(module, name, "plain tensors")
 
     def persistent_load(self, pid: Any) -> _Storage:
         kind, dtype, key, _device, count, *view = pid
@@ -129,9 +125,9 @@ def _read_zip(content: bytes) -> tuple[Any, dict[str, bytes]]:
         (name,) = (name for name in archive.namelist() if name.endswith("/data.pkl"))
         folder = name.removesuffix("data.pkl")
         if any(entry.compress_type != zipfile.ZIP_STORED for entry in archive.infolist()):
-            raise _RefusedError("is a compressed archive; expected one as torch.save writes it")
+            raise RefusedError("is a compressed archive; expected one as torch.save writes it")
         if f"{folder}byteorder" in archive.namelist() and archive.read(f"{folder}byteorder") != b"little":
-            raise _RefusedError("was saved on a big-endian machine; expected little-endian numbers")
+            raise RefusedError("was saved on a big-endian machine; expected little-endian numbers")
         saved, storages = _unpickle(io.BytesIO(archive.read(name)))
         return saved, {key: archive.read(f"{folder}data/{key}") for key in storages}
 
@@ -143,7 +139,7 @@ def _read_legacy(content: bytes) -> tuple[Any, dict[str, bytes]]:
     if (magic, version) != (_LEGACY_MAGIC, _LEGACY_VERSION):
         raise ValueError("another kind of pickle")
     if not system["little_endian"]:
-        raise _RefusedError("was saved on a big-endian machine; expected little-endian numbers")
+        raise RefusedError("was saved on a big-endian machine; expected little-endian numbers")
     saved, storages = _unpickle(stream)
     raw = {}
     for key in _unpickle(stream)[0]:
@@ -154,12 +150,7 @@ def _read_legacy(content: bytes) -> tuple[Any, dict[str, bytes]]:
 
 def _unpickle(stream: io.BytesIO) -> tuple[Any, dict[str, _Storage]]:
     """The next pickled object in the stream and the storages that it refers to."""
-    start, size = stream.tell(), len(stream.getbuffer())
-    for opcode, argument, _ in pickletools.genops(stream):
-        # A memo index sizes a table in memory: a damaged one would ask for gigabytes.
-        if "PUT" in opcode.name and isinstance(argument, int) and argument > size:
-            raise ValueError("a memo index beyond any that a file of this size can need")
-    stream.seek(start)
+    check_memo(stream)
     unpickler = _Unpickler(stream)
     return unpickler.load(), unpickler.storages
 

