@@ -87,8 +87,11 @@ def _presets() -> dict[str, Config]:
             ocd_lr=5e-5,
             decay_steps=2400,  # motion would end half learned if its rates fell to their end within the run
         ),
-        # Births leave the image as it is. Nothing is carried off: before its motion is learned, what moves is faint.
-        density=DensityConfig(method="mcmc", start=100, stop=800, interval=50, prune_opacity=0.0, max_gaussians="auto"),
+        # Births leave the image nearly as it is. Nothing is carried off: before its motion is learned, what moves is
+        # faint.
+        density=DensityConfig(
+            method="mcmc", start=100, stop=800, interval=50, prune_opacity=0.0, max_gaussians="auto", spread=0.5
+        ),
     )
     fast = dataclasses.replace(default, fine_steps=500, density=dataclasses.replace(default.density, stop=400))
     best = dataclasses.replace(

@@ -234,6 +234,11 @@ class DensityConfig:
     prune_above: Count = 0  # prune only when more Gaussians than this exist
     max_gaussians: Most = 360_000  # "auto": 0.6 a pixel of a frame, no more than that, at least the points
     noise: Number = 5e5  # "mcmc": on the centres of faint Gaussians, times their learning rate
+    spread: float = 0.0  # "mcmc": of a Gaussian's copies about it, in its standard deviations
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.spread < 1:
+            raise UserError(f"--density.spread {self.spread}: expected at least 0 and less than 1")
 
 
 @dataclass(frozen=True)

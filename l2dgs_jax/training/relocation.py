@@ -1,4 +1,9 @@
-"""Growth inside a fixed capacity, as Markov chain Monte Carlo: relocation, births and noise (arXiv 2404.09591)."""
+"""Growth inside a fixed capacity, as Markov chain Monte Carlo: relocation, births and noise (arXiv 2404.09591).
+
+There copies of a Gaussian are left where it is, for the noise to part them in the course of tens of thousands of steps.
+In a short training they would stay in one place, as good as one: their gradients have one direction, and Adam takes
+steps of one length. So they are parted at birth (`spread`).
+"""
 
 import math
 
@@ -24,8 +29,9 @@ def relocate(
     count: Int[Array, ""],
     key: PRNGKeyArray,
     dead_below: Float[Array, ""] | float,
+    spread: float = 0.0,
 ) -> Densified:
-    """Move dead Gaussians onto live ones and let others be born there, so that the image stays what it was.
+    """Move dead Gaussians onto live ones and let others be born there, so that the image stays nearly what it was.
 
     Sources are drawn in proportion to their opacity. A Gaussian that becomes n of them shares its opacity among them,
     and they shrink so that together they cover what it did (Eq. 9 there). Nothing here is differentiable.
@@ -36,6 +42,8 @@ def relocate(
         count: how many are to exist, at most N.
         key: randomness.
         dead_below: opacity at which a Gaussian is dead.
+        spread: standard deviation of the copies' centres, of that of their source along each of its axes, below 1.
+            They shrink so that together they keep its covariance. With 0 all stay where it is.
     """
     capacity = alive.shape[0]
     opacities = jnp.where(alive, jax.nn.sigmoid(gaussians.logit_opacities), 0)
@@ -60,12 +68,30 @@ def relocate(
         log_scales=jnp.where(split, jnp.log(opacities / cover), 0)[:, None] + gaussians.log_scales,
     )
     take = jnp.where(filled, source, jnp.arange(capacity, dtype=source.dtype))
+    copied = jax.tree.map(lambda rows: rows[take], sources)
     return Densified(
-        gaussians=jax.tree.map(lambda rows: rows[take], sources),
+        gaussians=_parted(copied, take, filled | split, jax.random.fold_in(key, 1), spread),
         alive=alive | (born & filled),
         changed=filled | split,
         wanted=jnp.zeros_like(count),
         missing=jnp.zeros_like(count),
+    )
+
+
+def _parted(
+    gaussians: Gaussians, source: Int[Array, " N"], copied: Bool[Array, " N"], key: PRNGKeyArray, spread: float
+) -> Gaussians:
+    """Copies moved apart at random, those of one source by 0 on average; what is not `copied` stays as it is."""
+    dtype = gaussians.means.dtype
+    together = lambda rows: jnp.zeros_like(rows).at[source].add(jnp.where(copied[:, None], rows, 0))[source]
+    number = jnp.maximum(together(jnp.ones((len(source), 1), dtype)), 2)
+    drawn = jax.random.normal(key, gaussians.means.shape, dtype)
+    apart = (drawn - together(drawn) / number) * jnp.sqrt(number / (number - 1))
+    offsets = rotate(gaussians.quats, spread * jnp.exp(gaussians.log_scales) * apart)
+    shrinking = math.log1p(-(spread**2)) / 2
+    return gaussians._replace(
+        means=gaussians.means + jnp.where(copied[:, None], offsets, 0),
+        log_scales=gaussians.log_scales + jnp.where(copied[:, None], shrinking, 0),
     )
 
 

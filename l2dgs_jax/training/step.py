@@ -117,7 +117,7 @@ def densify(state: TrainState, config: Config, growths_left: Int[Array, ""] | in
     if cfg.method == "mcmc":
         count = relocation.population(scene.alive.sum(), densification.most_gaussians(cfg), growths_left)
         own = jax.random.fold_in(key, 0)
-        result = relocation.relocate(scene.params.gaussians, scene.alive, count, own, cfg.prune_opacity)
+        result = relocation.relocate(scene.params.gaussians, scene.alive, count, own, cfg.prune_opacity, cfg.spread)
     else:
         result = densification.densify(scene.params.gaussians, scene.alive, state.stats, scene.extent, key, cfg)
 

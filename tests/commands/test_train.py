@@ -284,6 +284,7 @@ def test_what_cannot_start_leaves_no_folder(refuses, scene, tmp_path, monkeypatc
     monkeypatch.undo()
     unknown = "--optim.extent-scales"
     refuses(scene, unknown, "means", "plane", "--output", tmp_path / "run", naming=[unknown, "planes"])
+    refuses(scene, "--density.spread=1", "--output", tmp_path / "run", naming=["--density.spread 1"])
     refuses(scene, "--model.moving-share=0", "--output", tmp_path / "run", naming=["--model.moving-share 0"])
     with pytest.raises(ValueError, match="at least 2 cells"):
         train.main([str(scene), "--model.plane-size=1", "--output", str(tmp_path / "run")])

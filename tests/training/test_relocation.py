@@ -12,7 +12,7 @@ from tiny_training import batch_of, make_dataset, tiny
 from l2dgs_jax.rasterizer import rasterize
 from l2dgs_jax.training import engine, initial_state
 from l2dgs_jax.training.relocation import disturb, population, relocate
-from l2dgs_jax.training.step import train_step
+from l2dgs_jax.training.step import densify, train_step
 from l2dgs_jax.types import Gaussians
 
 WIDTH, HEIGHT = 40, 32
@@ -72,6 +72,44 @@ def test_together_the_copies_cover_what_their_source_did(opacity, copies):
     x = np.linspace(-12, 12, 20001)
     profile = 1 - np.prod([1 - o * np.exp(-0.5 * (x / s) ** 2) for o, s in zip(new, shrunk, strict=True)], axis=0)
     np.testing.assert_allclose(profile.sum(), (opacity * np.exp(-0.5 * x**2)).sum(), rtol=1e-6)
+
+
+@pytest.mark.parametrize("copies", [1, 3])
+def test_copies_are_parted_and_keep_centroid_and_covariance(copies):
+    count, spread = 6000, 0.6
+    rows = jax.tree.map(lambda x: jnp.tile(x[:1], (count * (copies + 1), *[1] * (x.ndim - 1))), gaussians([0.3]))
+    alive = jnp.arange(len(rows.means)) < 1
+    whole = relocate(rows, alive, jnp.array(copies + 1), jax.random.key(0), DEAD).gaussians
+
+    @jax.vmap
+    def parted(key):
+        few = jax.tree.map(lambda x: x[: copies + 1], rows)
+        return relocate(few, alive[: copies + 1], jnp.array(copies + 1), key, DEAD, spread).gaussians
+
+    found = parted(jax.random.split(jax.random.key(1), count))
+    np.testing.assert_allclose(found.means.mean(1), np.tile(rows.means[:1], (count, 1)), atol=1e-12)
+    own = np.exp(np.asarray(found.log_scales[0, 0]))
+    size = np.exp(np.asarray(whole.log_scales[0]))
+    np.testing.assert_allclose(own, size * np.sqrt(1 - spread**2), rtol=1e-9)
+    turn = Rotation.from_quat(rows.quats[0], scalar_first=True).as_matrix()
+    offsets = (np.asarray(found.means) - np.asarray(rows.means[0])) @ turn
+    together = np.cov(offsets.reshape(-1, 3).T) + np.diag(own**2)
+    np.testing.assert_allclose(together, np.diag(size**2), atol=0.05 * size.max() ** 2)
+
+
+def test_parted_births_leave_the_image_nearly_as_it_was():
+    rows = gaussians(np.tile(np.linspace(0.1, 0.95, 10), 9))
+    alive = jnp.arange(90) < 40
+    before = draw(rows, alive)
+    changes = []
+    for spread in (0.5, 0.9):
+        result = relocate(rows, alive, jnp.array(60), jax.random.key(1), DEAD, spread)
+        still = ~np.asarray(result.changed)
+        for old, new in zip(jax.tree.leaves(rows), jax.tree.leaves(result.gaussians), strict=True):
+            np.testing.assert_array_equal(new[still], old[still])
+        changes.append(float(jnp.abs(draw(result.gaussians, result.alive).alpha - before.alpha).mean()))
+    assert changes[0] < 0.03
+    assert changes[0] < changes[1]
 
 
 def test_the_dead_go_where_the_living_are_and_the_others_stay():
@@ -158,6 +196,16 @@ def test_training_meets_the_number_and_compiles_once():
     assert numbers == sorted(numbers)
     assert len(set(numbers)) == 5
     assert engine._densify_all._cache_size() == 1
+
+
+def test_births_of_a_training_are_parted_by_its_spread():
+    dataset = make_dataset()
+    for spread in (0.0, 0.5):
+        config = growing(spread=spread, noise=0.0)
+        state = initial_state(dataset, config)
+        grown, _ = jax.jit(densify, static_argnums=1)(state, config, 1)
+        means = np.asarray(grown.scene.params.gaussians.means)[np.asarray(grown.scene.alive)]
+        assert (len(means), len(np.unique(means, axis=0))) == (64, 64 if spread else 25)
 
 
 def test_noise_is_wired_to_its_strength_and_fades_with_the_learning_rate():
