@@ -90,7 +90,14 @@ def _presets() -> dict[str, Config]:
         # Births leave the image nearly as it is. Nothing is carried off: before its motion is learned, what moves is
         # faint.
         density=DensityConfig(
-            method="mcmc", start=100, stop=800, interval=50, prune_opacity=0.0, max_gaussians="auto", spread=0.5
+            method="mcmc",
+            start=100,
+            stop=800,
+            interval=50,
+            prune_opacity=0.0,
+            max_gaussians="auto",
+            drawn_by="gradient",
+            spread=0.5,
         ),
     )
     fast = dataclasses.replace(default, fine_steps=500, density=dataclasses.replace(default.density, stop=400))

@@ -234,6 +234,8 @@ class DensityConfig:
     prune_above: Count = 0  # prune only when more Gaussians than this exist
     max_gaussians: Most = 360_000  # "auto": 0.6 a pixel of a frame, no more than that, at least the points
     noise: Number = 5e5  # "mcmc": on the centres of faint Gaussians, times their learning rate
+    # "mcmc": which Gaussians have copies; "gradient": by opacity times the summed norm of dL/d(mean2d)
+    drawn_by: Literal["opacity", "gradient"] = "opacity"
     spread: float = 0.0  # "mcmc": of a Gaussian's copies about it, in its standard deviations
 
     def __post_init__(self) -> None:

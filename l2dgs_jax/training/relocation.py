@@ -16,6 +16,7 @@ from l2dgs_jax.training.densification import Densified, rotate
 from l2dgs_jax.types import Gaussians
 
 MOST = 51  # Gaussians that one may become at once
+LEAST_NEED = 1e-12  # of any Gaussian: where none needs copies, opacity decides
 STEEPNESS = 100.0  # of the noise's end as a Gaussian's opacity exceeds what counts as dead
 # Row n - 1 holds the signed binomials (-1)^(k - 1) C(n, k) / sqrt(k) for k = 1 ... MOST.
 _WEIGHTS = np.array(
@@ -30,11 +31,13 @@ def relocate(
     key: PRNGKeyArray,
     dead_below: Float[Array, ""] | float,
     spread: float = 0.0,
+    need: Float[Array, " N"] | None = None,
 ) -> Densified:
     """Move dead Gaussians onto live ones and let others be born there, so that the image stays nearly what it was.
 
-    Sources are drawn in proportion to their opacity. A Gaussian that becomes n of them shares its opacity among them,
-    and they shrink so that together they cover what it did (Eq. 9 there). Nothing here is differentiable.
+    Sources are drawn in proportion to their opacity, and to `need` if that is given. A Gaussian that becomes n of them
+    shares its opacity among them, and they shrink so that together they cover what it did (Eq. 9 there). Nothing here
+    is differentiable.
 
     Args:
         gaussians: rows, N of them.
@@ -44,6 +47,7 @@ def relocate(
         dead_below: opacity at which a Gaussian is dead.
         spread: standard deviation of the copies' centres, of that of their source along each of its axes, below 1.
             They shrink so that together they keep its covariance. With 0 all stay where it is.
+        need: of each Gaussian for copies, 0 or more; None for the same.
     """
     capacity = alive.shape[0]
     opacities = jnp.where(alive, jax.nn.sigmoid(gaussians.logit_opacities), 0)
@@ -51,7 +55,8 @@ def relocate(
     born = ~alive & (jnp.cumsum(~alive) <= count - alive.sum())
     filled = (born | (alive & ~live)) & live.any()
 
-    chances = jnp.cumsum(jnp.where(live, opacities, 0))
+    weights = opacities if need is None else opacities * (need + LEAST_NEED)
+    chances = jnp.cumsum(jnp.where(live, weights, 0))
     drawn = jax.random.uniform(key, (capacity,), chances.dtype) * chances[-1]
     source = jnp.minimum(jnp.searchsorted(chances, drawn, side="right"), capacity - 1)
     copies = jnp.zeros(capacity, jnp.int32).at[jnp.where(filled, source, capacity)].add(1, mode="drop")

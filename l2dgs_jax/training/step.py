@@ -117,7 +117,9 @@ def densify(state: TrainState, config: Config, growths_left: Int[Array, ""] | in
     if cfg.method == "mcmc":
         count = relocation.population(scene.alive.sum(), densification.most_gaussians(cfg), growths_left)
         own = jax.random.fold_in(key, 0)
-        result = relocation.relocate(scene.params.gaussians, scene.alive, count, own, cfg.prune_opacity, cfg.spread)
+        need = state.stats.gradient if cfg.drawn_by == "gradient" else None
+        gaussians, dead_below = scene.params.gaussians, cfg.prune_opacity
+        result = relocation.relocate(gaussians, scene.alive, count, own, dead_below, cfg.spread, need)
     else:
         result = densification.densify(scene.params.gaussians, scene.alive, state.stats, scene.extent, key, cfg)
 

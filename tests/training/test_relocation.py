@@ -135,6 +135,18 @@ def test_sources_are_drawn_in_proportion_to_their_opacity():
     np.testing.assert_allclose(drawn, opacities / opacities.sum(), atol=0.03)
 
 
+def test_sources_are_drawn_by_their_need_and_by_opacity_where_none_is_in_need():
+    opacities = np.array([0.2, 0.2, 0.8])
+    rows = gaussians(np.append(opacities, np.full(4000, 0.5)))
+    alive = jnp.arange(4003) < 3
+    for need, chances in (([1e-5, 3e-5, 0.0], [1, 3, 0]), ([0.0, 0.0, 0.0], opacities)):
+        everyone = jnp.asarray(np.append(need, np.full(4000, 7.0)))
+        result = relocate(rows, alive, jnp.array(4003), jax.random.key(0), DEAD, 0.0, everyone)
+        means = np.asarray(result.gaussians.means)
+        drawn = [np.all(means[3:] == mean[None], axis=1).mean() for mean in means[:3]]
+        np.testing.assert_allclose(drawn, np.array(chances) / np.sum(chances), atol=0.03)
+
+
 def test_where_nothing_lives_nothing_is_born():
     rows = gaussians([0.001, 0.002, 0.5])
     result = relocate(rows, jnp.array([True, True, False]), jnp.array(3), jax.random.key(0), DEAD)
@@ -206,6 +218,15 @@ def test_births_of_a_training_are_parted_by_its_spread():
         grown, _ = jax.jit(densify, static_argnums=1)(state, config, 1)
         means = np.asarray(grown.scene.params.gaussians.means)[np.asarray(grown.scene.alive)]
         assert (len(means), len(np.unique(means, axis=0))) == (64, 64 if spread else 25)
+
+
+def test_births_of_a_training_go_where_gradients_are():
+    dataset, config = make_dataset(), growing(drawn_by="gradient")
+    state = initial_state(dataset, config)
+    one = state.stats._replace(gradient=state.stats.gradient.at[3].set(1e-4))
+    grown, _ = jax.jit(densify, static_argnums=1)(state._replace(stats=one), config, 1)
+    colors, source = np.asarray(grown.scene.params.gaussians.reflectance), state.scene.params.gaussians.reflectance[3]
+    assert (colors == np.asarray(source)[None]).all(-1).sum() == 64 - 25 + 1
 
 
 def test_noise_is_wired_to_its_strength_and_fades_with_the_learning_rate():
