@@ -60,7 +60,8 @@ def relocate(
     chances = jnp.cumsum(jnp.where(live, weights, 0))
     drawn = jax.random.uniform(key, (capacity,), chances.dtype) * chances[-1]
     source = jnp.minimum(jnp.searchsorted(chances, drawn, side="right"), capacity - 1)
-    source = jnp.where(live[source], source, jnp.argmax(jnp.where(live, weights, 0)))  # beyond the last by rounding
+    likeliest = jnp.argmax(jnp.where(live, weights, 0)).astype(source.dtype)
+    source = jnp.where(live[source], source, likeliest)  # rounding may lead beyond those that live
     copies = jnp.zeros(capacity, jnp.int32).at[jnp.where(filled, source, capacity)].add(1, mode="drop")
 
     # (1 - new)^n = 1 - old, through logarithms.
