@@ -76,7 +76,7 @@ def test_together_the_copies_cover_what_their_source_did(opacity, copies):
 
 @pytest.mark.parametrize("copies", [1, 3])
 def test_copies_are_parted_and_keep_centroid_and_covariance(copies):
-    count, spread = 6000, 0.6
+    count, spread = 2000, 0.6
     rows = jax.tree.map(lambda x: jnp.tile(x[:1], (count * (copies + 1), *[1] * (x.ndim - 1))), gaussians([0.3]))
     alive = jnp.arange(len(rows.means)) < 1
     whole = relocate(rows, alive, jnp.array(copies + 1), jax.random.key(0), DEAD).gaussians
