@@ -1,13 +1,18 @@
-"""Files as torch.save writes them, made without PyTorch from pickle opcodes."""
+"""Files as torch.save writes them, made without PyTorch."""
 
 import io
 import pickle
 import struct
+import sys
 import zipfile
+from collections import OrderedDict
+from types import ModuleType
 from typing import NamedTuple
+from unittest import mock
 
 import numpy as np
 
+TORCH, UTILS = ModuleType("torch"), ModuleType("torch._utils")
 STORAGES = {
     "float64": "DoubleStorage",
     "float32": "FloatStorage",
@@ -15,7 +20,9 @@ STORAGES = {
     "int64": "LongStorage",
     "bool": "BoolStorage",
 }
-ORDERED_DICT = b"ccollections\nOrderedDict\n)R"
+for name in STORAGES.values():
+    setattr(TORCH, name, type(name, (), {"__module__": "torch"}))
+UTILS._rebuild_tensor_v2 = type("_rebuild_tensor_v2", (), {"__module__": "torch._utils"})
 
 
 class View(NamedTuple):
@@ -27,29 +34,50 @@ class View(NamedTuple):
     strides: tuple[int, ...]
 
 
-def state_dict(tensors, *, legacy, extra_elements=0):
+class Storage(tuple):
+    """The persistent id of a storage."""
+
+
+class Pickler(pickle.Pickler):
+    """Pickles views and storages as PyTorch does; the names that it writes are looked up in `sys.modules`."""
+
+    def __init__(self, stream, protocol, storage):
+        super().__init__(stream, protocol)
+        self.storage = storage
+
+    def persistent_id(self, value):
+        return tuple(value) if isinstance(value, Storage) else None
+
+    def reducer_override(self, value):
+        if not isinstance(value, View):
+            return NotImplemented
+        shape, strides = (*value.shape,), (*value.strides,)  # tuples of its own, as each tensor gives them
+        return UTILS._rebuild_tensor_v2, (self.storage(value.flat), value.offset, shape, strides, False, OrderedDict())
+
+
+def state_dict(tensors, *, legacy, extra_elements=0, protocol=2):
     """The pickle of a state_dict, and the bytes of its storages by key.
 
     Args:
         tensors: arrays or views by name.
         legacy: references to storages as in legacy files.
         extra_elements: that the storages claim and do not have.
+        protocol: of the pickle.
     """
-    flats, memo = {}, iter(range(2**16))
-    text = lambda s: b"X" + struct.pack("<I", len(s)) + s.encode() + b"r" + struct.pack("<I", next(memo))
-    number = lambda n: b"J" + struct.pack("<i", n)
-    sequence = lambda values: b"(" + b"".join(map(number, values)) + b"t"
-    out = [b"\x80\x02", ORDERED_DICT, b"("]
-    for name, tensor in tensors.items():
-        view = tensor if isinstance(tensor, View) else contiguous(tensor)
-        key = str(next((k for k, flat in flats.items() if flat is view.flat), len(flats)))
-        flats[key] = view.flat
-        storage = f"ctorch\n{STORAGES[str(view.flat.dtype)]}\n".encode()
-        reference = [b"(", text("storage"), storage, text(key), text("cuda:0"), number(view.flat.size + extra_elements)]
-        out += [text(name), b"ctorch._utils\n_rebuild_tensor_v2\n(", *reference, b"N" * legacy, b"tQ"]
-        out += [number(view.offset), sequence(view.shape), sequence(view.strides), b"\x89", ORDERED_DICT, b"tR"]
-    out += [b"u}", text("_metadata"), ORDERED_DICT, b"sb."]
-    return b"".join(out), {key: flat.tobytes() for key, flat in flats.items()}
+    flats = {}
+
+    def storage(flat):
+        key = next((key for key, known in flats.items() if known is flat), str(len(flats)))
+        flats[key] = flat
+        kind = getattr(TORCH, STORAGES[str(flat.dtype)])
+        return Storage(("storage", kind, key, "cuda:0", flat.size + extra_elements, *[None] * legacy))
+
+    saved = OrderedDict((name, x if isinstance(x, View) else contiguous(x)) for name, x in tensors.items())
+    saved._metadata = OrderedDict({"": {"version": 1}, "conv": {"version": 1}})
+    stream = io.BytesIO()
+    with mock.patch.dict(sys.modules, {"torch": TORCH, "torch._utils": UTILS}):
+        Pickler(stream, protocol, storage).dump(saved)
+    return stream.getvalue(), {key: flat.tobytes() for key, flat in flats.items()}
 
 
 def contiguous(array):
@@ -78,9 +106,9 @@ def legacy_file(content, raw, *, itemsizes=None, little_endian=True):
     return b"".join(parts)
 
 
-def saved(tensors, *, legacy):
+def saved(tensors, *, legacy, protocol=2):
     """The bytes of a whole file that holds `tensors`."""
-    content, raw = state_dict(tensors, legacy=legacy)
+    content, raw = state_dict(tensors, legacy=legacy, protocol=protocol)
     if not legacy:
         return zip_file(content, raw)
     flats = [x.flat if isinstance(x, View) else x for x in tensors.values()]

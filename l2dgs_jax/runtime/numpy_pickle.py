@@ -1,29 +1,16 @@
-"""NumPy arrays in nested dictionaries, as flax's users pickle parameters: nothing that a pickle may ask for is run.
+"""NumPy arrays in nested dictionaries, as flax's users pickle parameters: nothing that a pickle may ask for is run."""
 
-The few instructions that such a file needs are followed here, not by `pickle`, which even with no classes at hand can
-be led to exhaust the stack or the memory.
-"""
-
-import pickletools
+import io
 import re
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Shaped
 
-from l2dgs_jax.errors import UserError
-from l2dgs_jax.runtime.pickles import RefusedError, refused
+from l2dgs_jax.runtime.pickles import Arrays, RefusedError, follow, read_file
 
-Arrays = dict[str, Shaped[np.ndarray, "..."]]
-
-_MODULES = ("numpy", "numpy.core.multiarray", "numpy._core.multiarray")
-_NAMES = ("_reconstruct", "ndarray", "dtype")
-_IGNORED = ("PROTO", "FRAME", "STOP")
-_LITERALS = ("BINUNICODE", "SHORT_BINUNICODE", "BINBYTES", "SHORT_BINBYTES", "BININT", "BININT1", "BININT2", "LONG1")
-_CONSTANTS = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False, "EMPTY_TUPLE": ()}
-_TUPLES = {"TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3}
-_REUSED = 64  # characters or bytes of what a file may mention again instead of writing it twice
+_LONGEST_NAME = 256  # a long name would be repeated for every array below it
 
 
 def load(path: Path) -> Arrays:
@@ -38,105 +25,40 @@ def load(path: Path) -> Arrays:
     Raises:
         UserError: the file is missing, damaged, or holds something else.
     """
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read ({error.strerror}); expected pickled arrays") from None
-    try:
-        return _flat(_followed(content), "")
-    except RefusedError as refusal:
-        raise UserError(f"{path}: {refusal}") from None
-    except Exception:  # damaged pickles raise whatever their bytes lead to
-        raise UserError(f"{path}: damaged or of another kind; expected a dictionary of pickled arrays") from None
+    read = lambda content: _flat(follow(io.BytesIO(content), _NAMES, reusable=(_Type,)), "")
+    return read_file(path, read, "a dictionary of pickled arrays")
 
 
-class _Name(NamedTuple):
-    """What a file mentions by name, and never gets."""
+class _Described:
+    """What a pickle says of an object: the arguments that make it, and the state that completes it."""
 
-    name: str
+    def __init__(self, *arguments: Any):
+        self.arguments = arguments
 
-
-class _Made:
-    """What is made by calling a name: an empty array or a type, completed by its state."""
-
-    def __init__(self, name: str, arguments: tuple):
-        self.name, self.arguments = name, arguments
-        self.state: tuple = ()
+    def __setstate__(self, state: Any) -> None:
+        self.state = state
 
 
-def _followed(content: bytes) -> Any:
-    """What the pickle describes, of dictionaries, tuples, numbers, text, bytes and `_Made`."""
-    stack: list[Any] = []
-    marks: list[int] = []
-    memo: dict[int, Any] = {}
-
-    def since_mark() -> list[Any]:
-        start = marks.pop()
-        rest = stack[start:]
-        del stack[start:]
-        return rest
-
-    argument: Any
-    for opcode, argument, _ in pickletools.genops(content):
-        name = opcode.name
-        if name in _IGNORED:
-            continue
-        if name in _LITERALS:
-            stack.append(argument)
-        elif name in _CONSTANTS:
-            stack.append(_CONSTANTS[name])
-        elif name == "EMPTY_DICT":
-            stack.append({})
-        elif name == "MARK":
-            marks.append(len(stack))
-        elif name == "TUPLE":
-            rest = since_mark()
-            stack.append(tuple(rest))
-        elif name in _TUPLES:
-            rest = [stack.pop() for _ in range(_TUPLES[name])]
-            stack.append(tuple(reversed(rest)))
-        elif name in ("BINPUT", "LONG_BINPUT"):
-            memo[argument] = stack[-1]
-        elif name == "MEMOIZE":
-            memo[len(memo)] = stack[-1]
-        elif name in ("BINGET", "LONG_BINGET"):
-            stack.append(_reused(memo[argument]))
-        elif name in ("GLOBAL", "STACK_GLOBAL"):
-            module, asked = argument.split(" ") if name == "GLOBAL" else (stack.pop(-2), stack.pop())
-            if module not in _MODULES or asked not in _NAMES:
-                raise refused(module, asked, "plain arrays")
-            stack.append(_Name(asked))
-        elif name == "REDUCE":
-            arguments = stack.pop()
-            stack.append(_Made(stack.pop().name, arguments))
-        elif name == "BUILD":
-            state = stack.pop()
-            stack[-1].state = state
-        elif name in ("SETITEM", "SETITEMS"):
-            items = [stack.pop(-2), stack.pop()] if name == "SETITEM" else since_mark()
-            for key, value in zip(items[::2], items[1::2], strict=True):
-                if not isinstance(key, str):
-                    raise RefusedError("holds something else; expected dictionaries of arrays")
-                stack[-1][key] = value
-        else:
-            raise RefusedError("holds something else; expected dictionaries of arrays")
-    (found,) = stack
-    return found
+class _Array(_Described):
+    pass
 
 
-def _reused(value: Any) -> Any:
-    """A value that is mentioned again: never one that could make a small file a large one."""
-    small = isinstance(value, str | bytes) and len(value) <= _REUSED
-    if small or isinstance(value, _Name) or (isinstance(value, _Made) and value.name == "dtype"):
-        return value
-    raise ValueError("a value in two places")
+class _Type(_Described):
+    pass
+
+
+_NAMES = {
+    f"{module} {name}": stand_in
+    for module in ("numpy", "numpy.core.multiarray", "numpy._core.multiarray")
+    for name, stand_in in (("_reconstruct", _Array), ("dtype", _Type), ("ndarray", "an argument of _reconstruct"))
+}
 
 
 def _flat(tree: Any, name: str) -> Arrays:
-    if isinstance(tree, _Made):
+    if isinstance(tree, _Array):
         return {name: _array(tree)}
-    if not isinstance(tree, dict):
-        raise RefusedError("holds something else; expected dictionaries of arrays")
+    if not isinstance(tree, dict) or len(name) > _LONGEST_NAME:
+        raise RefusedError("holds something else")
     return {
         place: array
         for key, branch in tree.items()
@@ -144,10 +66,10 @@ def _flat(tree: Any, name: str) -> Arrays:
     }
 
 
-def _array(made: _Made) -> Shaped[np.ndarray, "..."]:
-    _version, shape, dtype, by_column, content = made.state
+def _array(described: _Array) -> Shaped[np.ndarray, "..."]:
+    _version, shape, dtype, by_column, content = described.state
     order = dtype.state[1]
     if not re.fullmatch("[<>|][fiub][1248]", f"{order}{dtype.arguments[0]}"):
-        raise RefusedError("holds elements of another type; expected numbers")
+        raise RefusedError("holds elements that are no numbers")
     flat = np.frombuffer(content, f"{order}{dtype.arguments[0]}")
     return flat.reshape(shape, order="F" if by_column else "C").copy()

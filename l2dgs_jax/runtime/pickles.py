@@ -1,10 +1,144 @@
-"""What is said of pickles that hold, or ask for, more than is supported."""
+"""Pickled arrays without `pickle`: the few instructions that they need are followed here.
+
+`pickle` itself, even with no classes at hand, can be led to exhaust the stack or the memory.
+"""
+
+import io
+import pickletools
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from jaxtyping import Shaped
+
+from l2dgs_jax.errors import UserError
+
+T = TypeVar("T")
+Arrays = dict[str, Shaped[np.ndarray, "..."]]
+
+_NUMBERS = ("BININT", "BININT1", "BININT2", "LONG1", "BINFLOAT")
+_TEXTS = ("BINUNICODE", "SHORT_BINUNICODE", "BINSTRING", "SHORT_BINSTRING", "BINBYTES", "SHORT_BINBYTES")
+_CONSTANTS = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False, "EMPTY_TUPLE": ()}
+# Of values that an instruction takes from the stack; the others take all since the last mark.
+_COUNTS = {"TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3, "APPEND": 1, "SETITEM": 2, "STACK_GLOBAL": 2, "REDUCE": 2}
+_SHORT = 64  # characters or bytes of what a file may mention again instead of writing it twice
 
 
 class RefusedError(Exception):
-    """What a sound file holds that is not supported; the message lacks only the file's name."""
+    """What a sound file holds that is not supported; the message lacks the file's name and what was expected."""
 
 
-def refused(module: str, name: str, expected: str) -> RefusedError:
-    """What is said of a pickle that asks for more than it is given."""
-    return RefusedError(f"asks to load {f'{module}.{name}'[:80]!r}; expected {expected} only (nothing was run)")
+def read_file(path: Path, read: Callable[[bytes], T], expected: str) -> T:
+    """What `read` makes of the bytes of a file.
+
+    Args:
+        path: the file.
+        read: may raise anything.
+        expected: what the file should hold, for messages.
+
+    Raises:
+        UserError: the file is missing, or `read` has raised something.
+    """
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read ({error.strerror}); expected {expected}") from None
+    try:
+        return read(content)
+    except RefusedError as refusal:
+        raise UserError(f"{path}: {refusal}; expected {expected}") from None
+    except Exception:  # damaged files raise whatever their bytes lead to
+        raise UserError(f"{path}: damaged or of another kind; expected {expected}") from None
+
+
+def follow(
+    stream: io.BytesIO,
+    names: Mapping[str, Any],
+    reusable: tuple[type, ...] = (),
+    persistent: Callable[[Any], Any] | None = None,
+) -> Any:
+    """What the next pickle of a stream describes; the stream is left behind its end.
+
+    It is made of dictionaries, lists, tuples, numbers, text and bytes, and of what `names` and `persistent` give. Only
+    short text and what is `reusable` can be in two places: a small file could become a large object otherwise.
+
+    Args:
+        stream: holds the pickle, and maybe more.
+        names: what stands for each "module name" that the pickle may mention; functions and classes may be called. What
+            they make is completed by its own `__setstate__`.
+        reusable: types of what is made so, whose values may be mentioned again.
+        persistent: gives what stands for a persistent id; without it there may be none.
+
+    Raises:
+        RefusedError: the pickle asks for more.
+        Exception: any other; the pickle is damaged.
+    """
+    stack: list[Any] = []
+    marks: list[int] = []
+    memo: dict[int, Any] = {}
+
+    def taken(instruction: str) -> list[Any]:
+        count = _COUNTS[instruction] if instruction in _COUNTS else len(stack) - marks.pop()
+        return [stack.pop() for _ in range(count)][::-1]
+
+    argument: Any
+    for opcode, argument, _ in pickletools.genops(stream):
+        name = opcode.name
+        match name:
+            case "PROTO" | "FRAME" | "STOP":
+                pass
+            case _ if name in _NUMBERS or name in _TEXTS:
+                stack.append(argument)
+            case _ if name in _CONSTANTS:
+                stack.append(_CONSTANTS[name])
+            case "EMPTY_LIST":
+                stack.append([])
+            case "EMPTY_DICT":
+                stack.append({})
+            case "MARK":
+                marks.append(len(stack))
+            case "TUPLE" | "TUPLE1" | "TUPLE2" | "TUPLE3":
+                stack.append(tuple(taken(name)))
+            case "APPEND" | "APPENDS":
+                values = taken(name)
+                stack[-1].extend(values)
+            case "SETITEM" | "SETITEMS":
+                values = taken(name)
+                stack[-1].update(dictionary(zip(values[::2], values[1::2], strict=True)))
+            case "BINPUT" | "LONG_BINPUT":
+                memo[argument] = stack[-1]
+            case "MEMOIZE":
+                memo[len(memo)] = stack[-1]
+            case "BINGET" | "LONG_BINGET":
+                value = memo[argument]
+                short = isinstance(value, str | bytes) and len(value) <= _SHORT
+                if not (short or callable(value) or isinstance(value, reusable)):
+                    raise RefusedError("holds one value in two places")
+                stack.append(value)
+            case "GLOBAL" | "STACK_GLOBAL":
+                asked = argument if name == "GLOBAL" else " ".join(taken(name))
+                if asked not in names:
+                    raise RefusedError(f"asks to load {asked.replace(' ', '.')[:80]!r} (nothing was run)")
+                stack.append(names[asked])
+            case "REDUCE":  # only `names` has brought anything onto the stack that can be called
+                function, arguments = taken(name)
+                stack.append(function(*arguments))
+            case "BUILD":
+                state = stack.pop()
+                if not isinstance(stack[-1], dict):  # whose state is the attributes of an OrderedDict
+                    stack[-1].__setstate__(state)
+            case "BINPERSID" if persistent:
+                stack.append(persistent(stack.pop()))
+            case _:
+                raise RefusedError("holds something else")
+    (found,) = stack
+    return found
+
+
+def dictionary(items: Iterable[Any] = ()) -> dict[str, Any]:
+    """A dictionary of pairs, the keys of which must be text: another could be nested too deep to be hashed."""
+    pairs = [(key, value) for key, value in items]
+    if not all(isinstance(key, str) for key, _ in pairs):
+        raise RefusedError("holds something else")
+    return dict(pairs)

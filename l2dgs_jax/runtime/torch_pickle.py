@@ -6,10 +6,7 @@ lie beside the pickle in a zip archive, or, before PyTorch 1.6, behind it in the
 
 import io
 import math
-import pickle
-import pickletools
 import zipfile
-from collections import OrderedDict
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,8 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Shaped
 
-from l2dgs_jax.errors import UserError
-from l2dgs_jax.runtime.pickles import RefusedError, refused
+from l2dgs_jax.runtime.pickles import Arrays, RefusedError, dictionary, follow, read_file
 
 _ZIP_START = b"PK\x03\x04"
 _LEGACY_MAGIC = 0x1950A86A20F9469CFC6C
@@ -34,9 +30,11 @@ _DTYPES = {
     "ByteStorage": "<u1",
     "BoolStorage": "?",
 }
+_DIMENSIONS = 64  # at most, of an array of NumPy
+_SHARED = 4  # times its size that the tensors of a file may fill where they share storages
 
 
-def load(path: Path) -> dict[str, Shaped[np.ndarray, "..."]]:
+def load(path: Path) -> Arrays:
     """Read a dictionary of tensors, such as `torch.save(model.state_dict(), path)` writes, in either format.
 
     The pickle can build dictionaries, lists and tensors, and nothing else; whatever more it asks for is refused.
@@ -50,22 +48,7 @@ def load(path: Path) -> dict[str, Shaped[np.ndarray, "..."]]:
     Raises:
         UserError: the file is missing, damaged, or holds something else.
     """
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read ({error.strerror}); expected a file that torch.save wrote") from None
-    read = _read_zip if content.startswith(_ZIP_START) else _read_legacy
-    try:
-        saved, storages = read(content)
-        if not isinstance(saved, dict) or not all(
-            isinstance(v, _Tensor) and isinstance(k, str) for k, v in saved.items()
-        ):
-            raise RefusedError("holds something else; expected a dictionary of tensors, as a model's state_dict")
-        return {name: _array(tensor, storages) for name, tensor in saved.items()}
-    except RefusedError as refusal:
-        raise UserError(f"{path}: {refusal}") from None
-    except Exception:  # damaged archives and pickles raise whatever their bytes lead to
-        raise UserError(f"{path}: damaged or of another kind; expected a whole file that torch.save wrote") from None
+    return read_file(path, _read, "a dictionary of tensors, as torch.save writes a state_dict")
 
 
 class _Storage(NamedTuple):
@@ -83,88 +66,90 @@ class _Tensor(NamedTuple):
     strides: tuple[int, ...]
 
 
-class _Unpickler(pickle.Unpickler):
-    """Builds descriptions of tensors and notes the storages that they need."""
-
-    def __init__(self, stream: io.BytesIO):
-        super().__init__(stream)
-        self.storages: dict[str, _Storage] = {}
-
-    def find_class(self, module: str, name: str) -> Any:
-        if (module, name) == ("collections", "OrderedDict"):
-            return OrderedDict
-        if (module, name) == ("torch._utils", "_rebuild_tensor_v2"):
-            return self._rebuild_tensor
-        if module == "torch" and name in _DTYPES:
-            return _DTYPES[name]
-        raise refused(module, name, "plain tensors")
-
-    def persistent_load(self, pid: Any) -> _Storage:
-        kind, dtype, key, _device, count, *view = pid
-        known = kind == "storage" and dtype in _DTYPES.values() and isinstance(key, str) and _natural([count])
-        if not known or view not in ([], [None]):
-            raise ValueError("not a reference to a storage")
-        storage = _Storage(key, dtype, count)
-        if self.storages.setdefault(key, storage) != storage:
-            raise ValueError("one storage in two forms")
-        return storage
-
-    def _rebuild_tensor(self, storage: _Storage, offset: int, shape: tuple, strides: tuple, *_: Any) -> _Tensor:
-        """Stands in for PyTorch's function of the same purpose; the view must lie within its storage."""
-        if not isinstance(storage, _Storage) or len(shape) != len(strides) or not _natural([offset, *shape, *strides]):
-            raise ValueError("not the arguments of a tensor")
-        last = offset + sum((size - 1) * stride for size, stride in zip(shape, strides, strict=True))
-        # Repeated elements (stride 0) could make a small file fill the memory; no weights are saved so.
-        if 0 not in shape and (last >= storage.elements or math.prod(shape) > storage.elements):
-            raise ValueError("a tensor larger than its storage")
-        return _Tensor(storage, offset, tuple(shape), tuple(strides))
+def _read(content: bytes) -> Arrays:
+    tensors, storages = (_read_zip if content.startswith(_ZIP_START) else _read_legacy)(content)
+    filled = sum(math.prod(tensor.shape) * np.dtype(tensor.storage.dtype).itemsize for tensor in tensors.values())
+    if filled > _SHARED * len(content):
+        raise RefusedError("holds tensors that together are many times larger than the file")
+    return {name: _array(tensor, storages[tensor.storage.key]) for name, tensor in tensors.items()}
 
 
-def _read_zip(content: bytes) -> tuple[Any, dict[str, bytes]]:
-    """The pickled object and the bytes of its storages, by key."""
+def _read_zip(content: bytes) -> tuple[dict[str, _Tensor], dict[str, bytes]]:
+    """The tensors and the bytes of their storages, by key."""
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
         (name,) = (name for name in archive.namelist() if name.endswith("/data.pkl"))
         folder = name.removesuffix("data.pkl")
         if any(entry.compress_type != zipfile.ZIP_STORED for entry in archive.infolist()):
-            raise RefusedError("is a compressed archive; expected one as torch.save writes it")
+            raise RefusedError("is a compressed archive")
+        if sum(entry.file_size for entry in archive.infolist()) > len(content):
+            raise ValueError("entries that overlap")
         if f"{folder}byteorder" in archive.namelist() and archive.read(f"{folder}byteorder") != b"little":
-            raise RefusedError("was saved on a big-endian machine; expected little-endian numbers")
-        saved, storages = _unpickle(io.BytesIO(archive.read(name)))
-        return saved, {key: archive.read(f"{folder}data/{key}") for key in storages}
+            raise RefusedError("was saved on a big-endian machine")
+        tensors = _tensors(io.BytesIO(archive.read(name)))
+        return tensors, {key: archive.read(f"{folder}data/{key}") for key in _storages(tensors)}
 
 
-def _read_legacy(content: bytes) -> tuple[Any, dict[str, bytes]]:
+def _read_legacy(content: bytes) -> tuple[dict[str, _Tensor], dict[str, bytes]]:
     """The same of a legacy file: magic number, version, system, object and list of keys, then all storages."""
     stream = io.BytesIO(content)
-    magic, version, system = (_unpickle(stream)[0] for _ in range(3))
+    magic, version, system = (follow(stream, {}) for _ in range(3))
     if (magic, version) != (_LEGACY_MAGIC, _LEGACY_VERSION):
         raise ValueError("another kind of pickle")
     if not system["little_endian"]:
-        raise RefusedError("was saved on a big-endian machine; expected little-endian numbers")
-    saved, storages = _unpickle(stream)
+        raise RefusedError("was saved on a big-endian machine")
+    tensors = _tensors(stream)
+    storages = _storages(tensors)
     raw = {}
-    for key in _unpickle(stream)[0]:
+    for key in follow(stream, {}):
+        if not isinstance(key, str):  # it could be nested too deep to be looked up
+            raise ValueError("not the key of a storage")
         count = int.from_bytes(stream.read(8), "little")
         raw[key] = stream.read(count * np.dtype(storages[key].dtype).itemsize)
-    return saved, raw
+    return tensors, raw
 
 
-def _unpickle(stream: io.BytesIO) -> tuple[Any, dict[str, _Storage]]:
-    """The next pickled object in the stream and the storages that it refers to."""
-    start, size = stream.tell(), len(stream.getbuffer())
-    for opcode, argument, _ in pickletools.genops(stream):
-        # A memo index sizes a table in memory: a damaged one would ask for gigabytes.
-        if "PUT" in opcode.name and isinstance(argument, int) and argument > size:
-            raise ValueError("a memo index beyond any that a file of this size can need")
-    stream.seek(start)
-    unpickler = _Unpickler(stream)
-    return unpickler.load(), unpickler.storages
+def _tensors(stream: io.BytesIO) -> dict[str, _Tensor]:
+    saved = follow(stream, _NAMES, reusable=(_Tensor,), persistent=_storage)
+    if not isinstance(saved, dict) or not all(isinstance(tensor, _Tensor) for tensor in saved.values()):
+        raise RefusedError("holds something else")
+    return saved
 
 
-def _array(tensor: _Tensor, storages: dict[str, bytes]) -> Shaped[np.ndarray, "..."]:
-    storage = tensor.storage
-    elements = np.frombuffer(storages[storage.key], storage.dtype)
-    if len(elements) != storage.elements:
+def _storages(tensors: dict[str, _Tensor]) -> dict[str, _Storage]:
+    return {tensor.storage.key: tensor.storage for tensor in tensors.values()}
+
+
+def _storage(reference: Any) -> _Storage:
+    """Stands for the storage that a persistent id refers to."""
+    kind, dtype, key, _device, count, *view = reference
+    known = kind == "storage" and dtype in _DTYPES.values() and isinstance(key, str) and _natural([count])
+    if not known or view not in ([], [None]):
+        raise ValueError("not a reference to a storage")
+    return _Storage(key, dtype, count)
+
+
+def _tensor(storage: Any, offset: Any, shape: Any, strides: Any, *_: Any) -> _Tensor:
+    """Stands for PyTorch's `_rebuild_tensor_v2`; the view must lie within its storage."""
+    sound = isinstance(storage, _Storage) and len(shape) == len(strides) <= _DIMENSIONS
+    if not sound or not _natural([offset, *shape, *strides]):
+        raise ValueError("not the arguments of a tensor")
+    last = offset + sum((size - 1) * stride for size, stride in zip(shape, strides, strict=True))
+    # Repeated elements (stride 0) could make a small file fill the memory; no weights are saved so.
+    if 0 not in shape and (last >= storage.elements or math.prod(shape) > storage.elements):
+        raise ValueError("a tensor larger than its storage")
+    return _Tensor(storage, offset, tuple(shape), tuple(strides))
+
+
+_NAMES = {
+    "collections OrderedDict": dictionary,
+    "torch._utils _rebuild_tensor_v2": _tensor,
+    **{f"torch {storage}": dtype for storage, dtype in _DTYPES.items()},
+}
+
+
+def _array(tensor: _Tensor, storage: bytes) -> Shaped[np.ndarray, "..."]:
+    elements = np.frombuffer(storage, tensor.storage.dtype)
+    if len(elements) != tensor.storage.elements:
         raise ValueError("a storage of another length")
     strides = [elements.itemsize * stride for stride in tensor.strides]
     return np.lib.stride_tricks.as_strided(elements[tensor.offset :], tensor.shape, strides).copy()
