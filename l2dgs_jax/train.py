@@ -46,7 +46,7 @@ class Train:
     Attributes:
         scene: folder of the scene, or "demo" for the clip that comes with the package.
         preset: settings to start from, which the options below override one by one; the defaults shown here are the
-            preset's. Their steps: demo 400, fast 600, default 1200 (about five minutes on one core for frames of
+            preset's. Their steps: demo 400, fast 600, default 1200 (about ten minutes on one core for frames of
             200x112, and more with pixels and points), best 5000, authors 17000, paper 23000; to compare with, 1200
             each: 4dgs, enhance-4dgs, curve-4dgs, static.
         output: run folder; a fresh one under runs/ if not given.

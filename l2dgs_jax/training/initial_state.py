@@ -19,7 +19,7 @@ from l2dgs_jax.training.seeds import find_seeds
 from l2dgs_jax.training.state import TrainState
 from l2dgs_jax.training.step import begin_stage
 
-GAUSSIANS_PER_PIXEL = 0.6  # of a frame
+GAUSSIANS_PER_PIXEL = 1.0  # of a frame
 MOST_GAUSSIANS = 360_000  # however large the frames
 DRIFT = 0.05  # standard deviation of the logarithms of the frames' gains from which exposure counts as drifting
 
