@@ -232,7 +232,7 @@ class DensityConfig:
     conserve_opacity: bool = False  # a new pair covers as much as its source did (arXiv 2404.06109)
     prune_opacity: Number = 0.005  # below it a Gaussian is removed, or moved to where it is needed
     prune_above: Count = 0  # prune only when more Gaussians than this exist
-    max_gaussians: Most = 360_000  # "auto": one a pixel of a frame, no more than that, at least the points
+    max_gaussians: Most = 360_000  # "auto": 0.6 to 1 a pixel of a frame, no more than that, at least the points
     noise: Number = 5e5  # "mcmc": on the centres of faint Gaussians, times their learning rate
     # "mcmc": which Gaussians have copies; "gradient": by opacity times the summed norm of dL/d(mean2d)
     drawn_by: Literal["opacity", "gradient"] = "opacity"

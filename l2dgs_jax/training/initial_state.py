@@ -19,7 +19,8 @@ from l2dgs_jax.training.seeds import find_seeds
 from l2dgs_jax.training.state import TrainState
 from l2dgs_jax.training.step import begin_stage
 
-GAUSSIANS_PER_PIXEL = 1.0  # of a frame
+GAUSSIANS_PER_PIXEL = (0.6, 1.0)  # of a frame: the bounds of what the number of views allows
+VIEWS_PER_GAUSSIAN = 40  # of a pixel: with fewer, more Gaussians fit noise
 MOST_GAUSSIANS = 360_000  # however large the frames
 DRIFT = 0.05  # standard deviation of the logarithms of the frames' gains from which exposure counts as drifting
 
@@ -73,8 +74,9 @@ def resolve(config: Config, dataset: Dataset) -> Config:
 
 
 def _most_gaussians(split: Split) -> int:
-    height, width = split.images.shape[1:3]
-    return min(round(GAUSSIANS_PER_PIXEL * height * width), MOST_GAUSSIANS)
+    views, height, width = split.images.shape[:3]
+    per_pixel = np.clip(views / VIEWS_PER_GAUSSIAN, *GAUSSIANS_PER_PIXEL)
+    return min(round(per_pixel * height * width), MOST_GAUSSIANS)
 
 
 def initial_state(dataset: Dataset, config: Config) -> TrainState:

@@ -60,9 +60,12 @@ def test_black_frames_are_refused(dataset):
         resolve(tiny(), dataclasses.replace(dataset, train=black))
 
 
-@pytest.mark.parametrize(("side", "found"), [(50, 2_500), (1_000, 360_000)])
-def test_how_many_gaussians_there_may_be_follows_the_pixels_up_to_a_bound(dataset, side, found):
-    frames = np.full((len(dataset.train.names), side, side, 3), 0.1, np.float16)
+@pytest.mark.parametrize(
+    ("views", "side", "found"),
+    [(3, 50, 1_500), (32, 50, 2_000), (80, 50, 2_500), (3, 1_000, 360_000)],
+)
+def test_how_many_gaussians_there_may_be_follows_pixels_and_views_up_to_a_bound(dataset, views, side, found):
+    frames = np.full((views, side, side, 3), 0.1, np.float16)
     large = dataclasses.replace(dataset, train=dataclasses.replace(dataset.train, images=frames))
     config = overrides.replace(tiny(), {"density.max_gaussians": "auto"})
     assert resolve(config, large).density.max_gaussians == found
