@@ -34,6 +34,7 @@ def test_without_low_light_there_is_no_curve(dataset):
     assert initial_state(dataset, tiny("4dgs")).scene.params.curves is None
 
 
+@pytest.mark.slow
 def test_each_frame_learns_its_own_curve(dataset):
     """Of frames that differ in brightness only, the adjustments come to say by how much."""
     gains = np.linspace(-0.3, 0.3, FRAMES)

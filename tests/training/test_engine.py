@@ -223,6 +223,7 @@ def test_a_step_with_a_nan_changes_nothing_and_stops_the_run(dataset):
         finish(dataclasses.replace(dataset, train=dataclasses.replace(dataset.train, images=images)), config)
 
 
+@pytest.mark.slow
 def test_vmap_over_scenes_equals_a_loop(dataset):
     config = tiny()
     datasets = [dataset, make_dataset(1)]

@@ -51,6 +51,7 @@ def test_estimates_are_exposed_like_their_frames():
     check_grads(lambda *x: objective.exposed(*map(jnp.asarray, x), jnp.array([1, 2])), (images, exposures), 1)
 
 
+@pytest.mark.slow
 def test_training_moves_the_gains_to_what_the_frames_say():
     dataset = drifting_dataset()
     changes = {"optim.exposures_lr": 0.02, "loss.ssim": 0.0, "coarse_steps": 100, "fine_steps": 0}

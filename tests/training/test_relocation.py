@@ -195,6 +195,7 @@ def growing(**changes):
     return dataclasses.replace(config, density=density)
 
 
+@pytest.mark.slow
 def test_training_meets_the_number_and_compiles_once():
     dataset, config = make_dataset(), growing()
     state = initial_state(dataset, config)
