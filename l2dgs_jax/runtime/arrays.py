@@ -1,5 +1,6 @@
 """Named arrays of files that others made: NumPy's .npz, or what PyTorch saved."""
 
+import io
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -8,9 +9,11 @@ from jaxtyping import Shaped
 
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.runtime import torch_pickle
+from l2dgs_jax.runtime.pickles import Arrays
+from l2dgs_jax.runtime.reading import read_file
 
 
-def load(path: Path, expected: str) -> dict[str, Shaped[np.ndarray, "..."]]:
+def load(path: Path, expected: str) -> Arrays:
     """Read an .npz, or a state_dict as torch.save writes it. Nothing that a file may ask for is run.
 
     Args:
@@ -22,13 +25,7 @@ def load(path: Path, expected: str) -> dict[str, Shaped[np.ndarray, "..."]]:
     """
     if path.suffix != ".npz":
         return torch_pickle.load(path)
-    try:
-        with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as file:
-            return dict(file)
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read ({error.strerror}); expected {expected}") from None
-    except Exception:  # damaged archives raise whatever their bytes lead to
-        raise UserError(f"{path}: damaged or no .npz; expected {expected}") from None
+    return read_file(path, _read_npz, expected)
 
 
 def expect_floats(
@@ -54,3 +51,8 @@ def expect_floats(
             f"{path}: '{name}' has shape {array.shape} and type {array.dtype}; expected {shape}, finite floats"
         )
     return array
+
+
+def _read_npz(content: bytes) -> Arrays:
+    with np.load(io.BytesIO(content), allow_pickle=False) as file:
+        return dict(file)

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Shaped
 
-from l2dgs_jax.runtime.pickles import Arrays, RefusedError, follow, read_file
+from l2dgs_jax.runtime.pickles import Arrays, follow
+from l2dgs_jax.runtime.reading import RefusedError, read_file
 
 _LONGEST_NAME = 256  # a long name would be repeated for every array below it
 

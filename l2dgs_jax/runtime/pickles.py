@@ -6,15 +6,13 @@
 import io
 import pickletools
 from collections.abc import Callable, Iterable, Mapping
-from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from jaxtyping import Shaped
 
-from l2dgs_jax.errors import UserError
+from l2dgs_jax.runtime.reading import RefusedError
 
-T = TypeVar("T")
 Arrays = dict[str, Shaped[np.ndarray, "..."]]
 
 _NUMBERS = ("BININT", "BININT1", "BININT2", "LONG1", "BINFLOAT")
@@ -23,33 +21,6 @@ _CONSTANTS = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False, "EMPTY_TUPLE": (
 # Of values that an instruction takes from the stack; the others take all since the last mark.
 _COUNTS = {"TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3, "APPEND": 1, "SETITEM": 2, "STACK_GLOBAL": 2, "REDUCE": 2}
 _SHORT = 64  # characters or bytes of what a file may mention again instead of writing it twice
-
-
-class RefusedError(Exception):
-    """What a sound file holds that is not supported; the message lacks the file's name and what was expected."""
-
-
-def read_file(path: Path, read: Callable[[bytes], T], expected: str) -> T:
-    """What `read` makes of the bytes of a file.
-
-    Args:
-        path: the file.
-        read: may raise anything.
-        expected: what the file should hold, for messages.
-
-    Raises:
-        UserError: the file is missing, or `read` has raised something.
-    """
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read ({error.strerror}); expected {expected}") from None
-    try:
-        return read(content)
-    except RefusedError as refusal:
-        raise UserError(f"{path}: {refusal}; expected {expected}") from None
-    except Exception:  # damaged files raise whatever their bytes lead to
-        raise UserError(f"{path}: damaged or of another kind; expected {expected}") from None
 
 
 def follow(

@@ -14,7 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Shaped
 
-from l2dgs_jax.runtime.pickles import Arrays, RefusedError, dictionary, follow, read_file
+from l2dgs_jax.runtime.pickles import Arrays, dictionary, follow
+from l2dgs_jax.runtime.reading import RefusedError, read_file
 
 _ZIP_START = b"PK\x03\x04"
 _LEGACY_MAGIC = 0x1950A86A20F9469CFC6C

@@ -86,7 +86,8 @@ def test_other_weights_are_refused(tmp_path, changes, message):
 
 def test_files_that_are_none_are_refused(tmp_path):
     (tmp_path / "text.npz").write_text("weights")
-    for name, message in (("missing.npz", "cannot be read"), ("text.npz", "damaged or no .npz; expected weights")):
+    refusals = {"missing.npz": "cannot be read", "text.npz": "damaged or of another kind; expected weights"}
+    for name, message in refusals.items():
         with pytest.raises(UserError, match=message):
             load_lpips("alex", [tmp_path / name])
 
