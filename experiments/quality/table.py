@@ -53,7 +53,7 @@ def collect(studies: Sequence[Path]) -> Found:
     found: Found = defaultdict(lambda: defaultdict(lambda: defaultdict(list)))
     for study in studies:
         if study.is_file():
-            for kept in json.loads(study.read_text()):
+            for kept in _kept(study):
                 found[tuple(kept["settings"].items())] |= kept["scenes"]
             continue
         members = json.loads((study / "results.json").read_text())["members"]
@@ -68,6 +68,16 @@ def collect(studies: Sequence[Path]) -> Found:
                 if score is not None:
                     scores[name].append(score)
     return found
+
+
+def _kept(path: Path) -> list[dict[str, Any]]:
+    """The rows of a file; what another file beside it has already is named there by that file and its row."""
+    rows = json.loads(path.read_text())
+    for row in rows:
+        if isinstance(row["scenes"], list):
+            name, index = row["scenes"]
+            row["scenes"] = _kept(path.parent / name)[index]["scenes"]
+    return rows
 
 
 def _score(scores: Any, path: Sequence[str]) -> float | None:
