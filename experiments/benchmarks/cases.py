@@ -18,6 +18,7 @@ from experiments.benchmarks.scenes import cloud, fine_state, training, video
 from experiments.benchmarks.stopwatch import best_of, peak_memory, resident_memory
 from l2dgs_jax.config import PRESETS, Config, overrides
 from l2dgs_jax.config.overrides import StaticConfig
+from l2dgs_jax.data import load_dataset
 from l2dgs_jax.model import channels, hexplane, networks
 from l2dgs_jax.model.decomposition import decompose
 from l2dgs_jax.model.deformation import deform
@@ -27,6 +28,8 @@ from l2dgs_jax.runtime import devices
 from l2dgs_jax.runtime.capacity import next_capacity
 from l2dgs_jax.runtime.prefetch import prefetch
 from l2dgs_jax.training import engine, losses
+from l2dgs_jax.training.flows import neighbour_flows
+from l2dgs_jax.training.seeds import find_seeds
 from l2dgs_jax.training.step import adam
 from l2dgs_jax.types import Camera, MovedGaussians, RenderOutput, Scene
 
@@ -166,6 +169,16 @@ def rendering() -> Figures:
     return _rendering(CONFIG) | {f"tenth_moving_{name}": rate for name, rate in _rendering(TENTH).items()}
 
 
+def seeding() -> Figures:
+    """What precedes the first step: flow between the frames of the demo clip, and seeds on what it shows to move."""
+    dataset = load_dataset("demo")
+    most = dataset.width * dataset.height
+    return {
+        "demo_flow_ms": best_of(lambda: neighbour_flows(dataset.train), 3),
+        "demo_flow_and_seeds_ms": best_of(lambda: find_seeds(dataset.points, dataset.train, most), 3),
+    }
+
+
 def compiling() -> Figures:
     """Time to the end of a stage's first step in a new process, cache empty and then filled."""
     figures = {}
@@ -194,7 +207,8 @@ def scale() -> Figures:
 
 
 CASES: dict[str, Callable[[], Figures]] = {
-    case.__name__: case for case in (rasterizer, growth, folding, parts, step, rendering, compiling, memory, scale)
+    case.__name__: case
+    for case in (rasterizer, growth, folding, parts, step, rendering, seeding, compiling, memory, scale)
 }
 
 

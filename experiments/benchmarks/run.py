@@ -23,7 +23,7 @@ class Options:
     """Measure speed and memory; run it on idle cores.
 
     Attributes:
-        cases: which to run: rasterizer, growth, folding, parts, step, rendering, compiling, memory, scale.
+        cases: which to run.
         json: where to write the figures.
         check: exit with code 1 if a figure is worse than the baseline of this machine by more than the tolerance.
         update: make them the baseline of this machine.
