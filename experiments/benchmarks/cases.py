@@ -1,6 +1,7 @@
 """What is measured. A case is a function that returns its figures by name; names end in their unit."""
 
 import dataclasses
+import itertools
 import subprocess
 import sys
 import tempfile
@@ -64,6 +65,7 @@ SCALES = (  # Gaussians, frames, width, height
     (200_000, 1_000, 800, 450),
     (500_000, 300, 400, 225),
 )
+PLACES = ("memory", "file")  # of the frames
 
 
 def rasterizer() -> Figures:
@@ -198,12 +200,16 @@ def memory() -> Figures:
 def scale() -> Figures:
     """Fine steps and the peak of their process, start included, with the frames in memory and in a file."""
     figures = {}
-    for count, frames, width, height in SCALES:
-        name = f"{count // 1000}k_{frames}_frames_{width}x{height}"
-        for place in ("memory", "file"):
-            milliseconds, peak = _child("training", *map(str, (count, frames, width, height)), place).split()
-            figures |= {f"{name}_{place}_ms": float(milliseconds), f"{name}_{place}_peak_gib": float(peak)}
+    for size, place in itertools.product(SCALES, PLACES):
+        milliseconds, peak = _child("training", *map(str, size), place).split()
+        name = scale_name(*size, place)
+        figures |= {f"{name}_ms": float(milliseconds), f"{name}_peak_gib": float(peak)}
     return figures
+
+
+def scale_name(count: int, frames: int, width: int, height: int, place: str) -> str:
+    """How figures of one of `SCALES` begin."""
+    return f"{count // 1000}k_{frames}_frames_{width}x{height}_{place}"
 
 
 CASES: dict[str, Callable[[], Figures]] = {

@@ -1,10 +1,13 @@
 """`python -m experiments.benchmarks.table BASELINE`: the tables of docs/speed.md, from the figures of a machine."""
 
+import itertools
 import json
 import sys
 from pathlib import Path
 
 import tyro
+
+from experiments.benchmarks.cases import PLACES, SCALES, scale_name
 
 Figures = dict[str, dict[str, float]]  # by case and name
 TABLES = {
@@ -57,6 +60,17 @@ def markdown(title: str, figures: Figures) -> str:
     return "".join(f"{row}\n" for row in rows)
 
 
+def larger_scenes(figures: Figures) -> str:
+    """A row for each of `SCALES` and each place of its frames."""
+    rows = ["| Gaussians | frames | size | frames lie in | step | peak |", "|---|---|---|---|---|---|"]
+    for size, place in itertools.product(SCALES, PLACES):
+        count, frames, width, height = size
+        name = scale_name(*size, place)
+        found = (shown(unit, figures["scale"][f"{name}{unit}"]) for unit in ("_ms", "_peak_gib"))
+        rows.append(f"| {count:,} | {frames:,} | {width}x{height} | {place} | {' | '.join(found)} |")
+    return "".join(f"{row}\n" for row in rows)
+
+
 def shown(name: str, value: float) -> str:
     """Two digits are all that a shared machine is good for."""
     unit = next((unit for ending, unit in UNITS.items() if name.endswith(ending)), "")
@@ -70,7 +84,8 @@ def main(baseline: tyro.conf.Positional[Path]) -> None:
         baseline: file that `run --update` has written.
     """
     figures = json.loads(baseline.read_text())["figures"]
-    sys.stdout.write("\n".join(f"## {title}\n\n{markdown(title, figures)}" for title in TABLES))
+    tables = {title: markdown(title, figures) for title in TABLES} | {"Larger scenes": larger_scenes(figures)}
+    sys.stdout.write("\n".join(f"## {title}\n\n{table}" for title, table in tables.items()))
 
 
 if __name__ == "__main__":

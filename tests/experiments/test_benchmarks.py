@@ -31,3 +31,8 @@ def test_figures_are_rounded_and_have_their_unit(name, value, shown):
 def test_the_documentation_shows_what_was_measured(title):
     figures = json.loads(BASELINE.read_text())["figures"]
     assert table.markdown(title, figures) in (ROOT / "docs" / "speed.md").read_text()
+
+
+def test_so_it_does_of_larger_scenes():
+    figures = json.loads(BASELINE.read_text())["figures"]
+    assert table.larger_scenes(figures) in (ROOT / "docs" / "speed.md").read_text()
