@@ -66,6 +66,7 @@ def _presets() -> dict[str, Config]:
             bafe=False,  # of light, one gain explains a dark frame
         ),
         loss=LossConfig(
+            eta_end=0.75,  # brightened more than that, dark frames are mostly noise to SSIM
             exposure=1.0,
             exposure_level="auto",
             exposure_of="welllit",
