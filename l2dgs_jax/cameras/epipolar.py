@@ -64,16 +64,55 @@ def static_residuals(
     Returns:
         Pixels, for C = K + 1 guesses in each of K views.
     """
+    far, a, b = depth_equations(geometry, pixels, matches)
+    proposals = np.clip(proposed(a, b), *inverse_depths)
+    proposals = np.concatenate([proposals, np.median(proposals, axis=0, keepdims=True)]).astype(matches.dtype)
+    return np.stack([epipolar_residuals(geometry, far, matches, w) for w in proposals])
+
+
+class DepthEquations(NamedTuple):
+    """Of every match, two equations a + w b = 0 of the inverse depth w: far + w e is parallel to (match, 1).
+
+    Attributes:
+        far: directions in which the infinitely far would be seen.
+        a: see above.
+        b: likewise.
+    """
+
+    far: Float[np.ndarray, "K *S 3"]
+    a: Float[np.ndarray, "K *S 2"]
+    b: Float[np.ndarray, "K *S 2"]
+
+
+def depth_equations(
+    geometry: EpipolarGeometry, pixels: Float[np.ndarray, "*S 2"], matches: Float[np.ndarray, "K *S 2"]
+) -> DepthEquations:
+    """What matches of pixels with K other views say of their inverse depth, in the type of the matches."""
     kind = matches.dtype
-    broadcast = (slice(None), *(None,) * (pixels.ndim - 1))
-    e = geometry.e.astype(kind)[broadcast]
+    e = geometry.e.astype(kind)[_over(pixels)]
     far = np.stack([pixels @ H[:, :2].T + H[:, 2] for H in geometry.H.astype(kind)])
-    # far + w e is parallel to (match, 1): two equations a + w b = 0.
-    a = far[..., :2] - matches * far[..., 2:]
-    b = e[..., :2] - matches * e[..., 2:]
-    proposals = np.clip(-(a * b).sum(-1) / np.maximum((b * b).sum(-1), np.finfo(kind).tiny), *inverse_depths)
-    proposals = np.concatenate([proposals, np.median(proposals, axis=0, keepdims=True)]).astype(kind)
-    return np.stack([np.linalg.norm(_pixels(far + w[..., None] * e) - matches, axis=-1) for w in proposals])
+    return DepthEquations(far, far[..., :2] - matches * far[..., 2:], e[..., :2] - matches * e[..., 2:])
+
+
+def proposed(a: Float[np.ndarray, "*S 2"], b: Float[np.ndarray, "*S 2"]) -> Float[np.ndarray, "*S"]:
+    """The inverse depths that solve the `DepthEquations` best, each match's for itself."""
+    return -(a * b).sum(-1) / np.maximum((b * b).sum(-1), np.finfo(b.dtype).tiny)
+
+
+def epipolar_residuals(
+    geometry: EpipolarGeometry,
+    far: Float[np.ndarray, "K *S 3"],
+    matches: Float[np.ndarray, "K *S 2"],
+    inverse_depth: Float[np.ndarray, "*S"],
+) -> Float[np.ndarray, " K *S"]:
+    """Pixels between matches and where they would be at that inverse depth; `far` is of their `DepthEquations`."""
+    e = geometry.e.astype(matches.dtype)[_over(inverse_depth[..., None])]
+    return np.linalg.norm(_pixels(far + inverse_depth[..., None] * e) - matches, axis=-1)
+
+
+def _over(pixels: Float[np.ndarray, "*S 2"] | Float[np.ndarray, "*S 1"]) -> tuple:
+    """The index that lets one row for each of K views meet all pixels."""
+    return slice(None), *(None,) * (pixels.ndim - 1)
 
 
 def _pixels(directions: Float[np.ndarray, "*S 3"]) -> Float[np.ndarray, "*S 2"]:

@@ -102,6 +102,8 @@ class ModelConfig:
     # Whether what moves starts as Gaussians with paths and lifetimes of their own, from tracks of optical flow
     # (training/seeds.py); the motion field acts on top
     tracks: bool = False
+    # Whether points on what stands still are added where flow tells how far away it is (training/surfaces.py)
+    surfaces: bool = False
     identity_start: bool = False  # heads and OCD-Net start as "no motion, a_j = 1" instead of at random
     illumination_offset: Number = 0.5  # l = max(offset + sum a_j b_j B_j, 0)
     # N(0, 1), U(0, 1), or the frames' colours at the points, with the darkening of model/tone.py undone

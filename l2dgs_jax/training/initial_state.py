@@ -18,6 +18,7 @@ from l2dgs_jax.runtime.capacity import next_capacity
 from l2dgs_jax.training.seeds import find_seeds
 from l2dgs_jax.training.state import TrainState
 from l2dgs_jax.training.step import begin_stage
+from l2dgs_jax.training.surfaces import find_surfaces
 
 GAUSSIANS_PER_PIXEL = (0.6, 1.0)  # of a frame: the bounds of what the number of views allows
 VIEWS_PER_GAUSSIAN = 40  # of a pixel: with fewer, more Gaussians fit noise
@@ -81,11 +82,17 @@ def _most_gaussians(split: Split) -> int:
 
 def initial_state(dataset: Dataset, config: Config) -> TrainState:
     """The state before the first step of a `resolve`d config; the same seed and data give the same state."""
-    order, train = z_order(dataset.points), dataset.train
-    points, colors = dataset.points[order], None if dataset.colors is None else dataset.colors[order]
+    train, points, colors = dataset.train, dataset.points, dataset.colors
+    if config.model.surfaces:
+        found = find_surfaces(points, train, most=max(_most_gaussians(train) - len(points), 0))
+        if colors is not None:
+            colors = np.concatenate([colors, observed_colors(found, train.cameras, train.images, train.valid)])
+        points = np.concatenate([points, found])
+    order = z_order(points)
+    points, colors = points[order], None if colors is None else colors[order]
     seeds = None
     if config.model.tracks:
-        seeds = find_seeds(points, train, most=_most_gaussians(train))
+        seeds = find_seeds(dataset.points, train, most=_most_gaussians(train))  # depths of what moves suit these
     capacity = len(points) + (0 if seeds is None else len(seeds.points))
     if config.density.start < config.density.stop:
         most = max(int(config.density.max_gaussians), capacity)
