@@ -28,7 +28,8 @@ TITLES = {"psnr": "PSNR", "ssim": "SSIM", "lpips_alex": "LPIPS", "psnr_gain": "P
 CONVENTION: Convention = "paper"  # of regions, with LPIPS; PSNR and SSIM are the same by the usual one
 # Steps and sizes of a smoke run; the number of steps is that of each stage that a member has.
 QUICK_STEPS = 3
-QUICK = {"model.plane_size": 8, "model.hidden": 8, "model.tracks": False, "inbetweens": 0.0, "density.stop": 0}
+QUICK = {"model.plane_size": 8, "model.hidden": 8, "model.tracks": False, "model.surfaces": False}
+QUICK |= {"inbetweens": 0.0, "density.stop": 0}
 
 
 @dataclass(frozen=True)

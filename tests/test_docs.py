@@ -26,7 +26,8 @@ from l2dgs_jax.training import engine
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 SHORT = ["--coarse-steps=0", "--fine-steps=2", "--model.plane-size=4", "--model.plane-scales=1", "--model.hidden=8"]
-SHORT += ["--model.plane-channels=2", "--model.no-tracks", "--inbetweens=0", "--no-report"]
+SHORT += ["--model.plane-channels=2", "--model.no-tracks", "--model.no-surfaces", "--inbetweens=0"]
+SHORT += ["--no-report"]
 # Not run: what installs; what finds poses, trains studies or chooses kernels, as their own tests do; and what wants
 # several hosts, weights that are not here, or hours.
 INSTALLS = ("git ", "cd ", "pip ", "pytest", "pre-commit")

@@ -29,6 +29,7 @@ def tiny(preset="default", **changes):
         exposure="steady",
         tone="linear-light" if base.model.tone == "auto" else base.model.tone,
         tracks=False,
+        surfaces=False,
         plane_size=4,
         plane_scales=(1, 2),
         plane_channels=2,

@@ -32,6 +32,7 @@ from l2dgs_jax.training import engine, losses
 from l2dgs_jax.training.flows import neighbour_flows
 from l2dgs_jax.training.seeds import find_seeds
 from l2dgs_jax.training.step import adam
+from l2dgs_jax.training.surfaces import find_surfaces
 from l2dgs_jax.types import Camera, MovedGaussians, RenderOutput, Scene
 
 Figures = dict[str, float]
@@ -172,12 +173,13 @@ def rendering() -> Figures:
 
 
 def seeding() -> Figures:
-    """What precedes the first step: flow between the frames of the demo clip, and seeds on what it shows to move."""
+    """What precedes the first step, of the demo clip: flow between frames, seeds on what moves, points on the rest."""
     dataset = load_dataset("demo")
     most = dataset.width * dataset.height
     return {
         "demo_flow_ms": best_of(lambda: neighbour_flows(dataset.train), 3),
         "demo_flow_and_seeds_ms": best_of(lambda: find_seeds(dataset.points, dataset.train, most), 3),
+        "demo_surfaces_ms": best_of(lambda: find_surfaces(dataset.points, dataset.train, most), 3),
     }
 
 

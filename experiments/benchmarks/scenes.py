@@ -69,8 +69,9 @@ def fine_state(dataset: Dataset, config: Config) -> TrainState:
     """The start of the fine stage, with the `cloud` of a `video` as Gaussians and paths along which nothing moves."""
     count, frames = len(dataset.points), len(dataset.train.names)
     arrays = cloud(count, dataset.width, dataset.height)
-    # Tracks found in noise would add Gaussians.
-    scene = initial_state(dataset, overrides.replace(config, {"model.tracks": False})).scene
+    # Tracks and surfaces found in noise would add Gaussians.
+    alone = overrides.replace(config, {"model.tracks": False, "model.surfaces": False})
+    scene = initial_state(dataset, alone).scene
     rows = partial(pad_rows, capacity=len(scene.alive))
     gaussians = scene.params.gaussians._replace(
         quats=rows(jnp.asarray(arrays["quats"])),

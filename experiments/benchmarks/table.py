@@ -40,6 +40,7 @@ TABLES = {
         "the motion field acting on a tenth of the Gaussians": "rendering tenth_moving_welllit_frames_per_s",
         "before the first step: flow of the demo clip, 39 frames of 256x192": "seeding demo_flow_ms",
         "flow and seeds": "seeding demo_flow_and_seeds_ms",
+        "points on what stands still": "seeding demo_surfaces_ms",
         "peak memory of steps at 800x450 with 50,000 Gaussians": "memory 50k_800x450_peak_gib",
         "growth of memory over 1,000 steps of a small scene": "memory thousand_steps_growth_gib",
         "first step of the coarse stage in a new process, compilation cache empty": "compiling coarse_cold_s",

@@ -51,11 +51,13 @@ def _presets() -> dict[str, Config]:
             scale_growth="linear",  # exponentially, a few Gaussians come to fill the picture
             motion_gate=True,
             tracks=True,
+            surfaces=True,  # in the dark, structure from motion finds few points
             hidden=64,
             plane_scales=(1, 2),
             opacity_head=True,  # a copy of what moves can fade where it does not belong
             identity_start=True,  # the fine stage starts from the coarse stage's result instead of from a jump
             reflectance_init="observed",
+            bounded_reflectance=True,  # or what few frames see takes colours that no frame shows
             initial_exponents=("auto", 9.0),
             initial_illumination="auto",
             initial_opacity=0.3,
@@ -86,6 +88,7 @@ def _presets() -> dict[str, Config]:
             heads_lr=1.5e-3,
             planes_lr=1.6e-2,
             ocd_lr=5e-5,
+            scales_lr=0.012,  # there are nearly as many points as Gaussians from the start
             decay_steps=2400,  # motion would end half learned if its rates fell to their end within the run
         ),
         # Births leave the image nearly as it is. Nothing is carried off: before its motion is learned, what moves is
@@ -109,13 +112,14 @@ def _presets() -> dict[str, Config]:
         optim=dataclasses.replace(default.optim, decay_steps=7500),
         density=dataclasses.replace(default.density, stop=3000),
     )
-    # A smaller motion field and fewer steps, in which nothing is added; so sizes must learn faster.
+    # A smaller motion field, the scene's own points and fewer steps, in which nothing is added; so sizes must learn
+    # faster.
     demo = dataclasses.replace(
         default,
         coarse_steps=150,
         fine_steps=250,
         sh_warmup=150,
-        model=dataclasses.replace(default.model, plane_size=32, hidden=32),
+        model=dataclasses.replace(default.model, plane_size=32, hidden=32, surfaces=False),
         optim=dataclasses.replace(default.optim, scales_lr=0.04, quats_lr=4e-3, decay_steps=None),
         density=dataclasses.replace(default.density, stop=0),
     )

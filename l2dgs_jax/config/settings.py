@@ -108,6 +108,8 @@ class ModelConfig:
     illumination_offset: Number = 0.5  # l = max(offset + sum a_j b_j B_j, 0)
     # N(0, 1), U(0, 1), or the frames' colours at the points, with the darkening of model/tone.py undone
     reflectance_init: Literal["normal", "uniform", "observed"] = "uniform"
+    # Whether reflectances stay in [0, 1] after every step, those of Gaussians as those of images
+    bounded_reflectance: bool = False
     attenuation_init: Literal["normal", "uniform"] = "uniform"  # N(0, 1) or U(0, 1)
     # B1, B2 that BAFE-Net starts at; None: zero bias, 5.5. B1 "auto": what the frames' darkness implies (model/tone.py)
     initial_exponents: Exponents = None

@@ -84,7 +84,7 @@ def initial_state(dataset: Dataset, config: Config) -> TrainState:
     """The state before the first step of a `resolve`d config; the same seed and data give the same state."""
     train, points, colors = dataset.train, dataset.points, dataset.colors
     if config.model.surfaces:
-        found = find_surfaces(points, train, most=max(_most_gaussians(train) - len(points), 0))
+        found = find_surfaces(points, train, most=max(int(config.density.max_gaussians) - len(points), 0))
         if colors is not None:
             colors = np.concatenate([colors, observed_colors(found, train.cameras, train.images, train.valid)])
         points = np.concatenate([points, found])

@@ -55,6 +55,9 @@ def train_step(
         value_and_grad, transformation, state.scene.params, state.adam
     )
 
+    if config.model.bounded_reflectance:
+        bounded = jnp.clip(params.gaussians.reflectance, 0, 1)
+        params = params._replace(gaussians=params.gaussians._replace(reflectance=bounded))
     if config.density.method == "mcmc":
         params = params._replace(gaussians=_disturbed(params.gaussians, state, config))
     height, width = batch.images.shape[1:3]

@@ -122,6 +122,7 @@ def test_a_browser_sees_a_training_go_on(tmp_path):
     finished_run.folder(tmp_path)
     command = [sys.executable, "-m", "l2dgs_jax.train", str(tmp_path / "tiny_scene"), "--output", str(tmp_path / "run")]
     small = ["--model.hidden=8", "--model.plane-size=4", "--model.plane-channels=2", "--model.no-tracks"]
+    small += ["--model.no-surfaces"]
     steps = ["--coarse-steps=1", "--fine-steps=100000", "--devices=1", "--no-report", "--view", "--view-port=8927"]
     quickly = os.environ | {"XLA_FLAGS": "--xla_backend_optimization_level=0"}
     with subprocess.Popen([*command, *small, *steps], env=quickly, stderr=subprocess.PIPE, text=True) as training:

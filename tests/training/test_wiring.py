@@ -269,3 +269,15 @@ def test_bands_by_the_length_of_the_run(dataset):
     config = dataclasses.replace(config, model=dataclasses.replace(config.model, sh_degree=3))
     bands = [int(objective.sh_degree(number, config)) for number in (0, 19, 20, 40, 59, 60, 119)]
     assert bands == [0, 0, 1, 2, 2, 3, 3]
+
+
+@pytest.mark.parametrize("bounded", [True, False])
+def test_reflectances_are_held_in_their_range_where_they_are_to_be(dataset, bounded):
+    config = config_of(**{"model.bounded_reflectance": bounded, "optim.reflectance_lr": 0.3})
+    state, batch = initial_state(dataset, config), batch_of(dataset.train, [0, 3])
+    step = jax.jit(partial(train_step, config=config, moving=False, pair_capacity=4096))
+    for _ in range(8):
+        state, _ = step(state, batch)
+    reflectance = state.scene.params.gaussians.reflectance
+    assert bool(jnp.all((reflectance >= 0) & (reflectance <= 1))) is bounded
+    assert bool(jnp.isfinite(reflectance).all())
