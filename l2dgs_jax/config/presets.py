@@ -88,7 +88,6 @@ def _presets() -> dict[str, Config]:
             heads_lr=1.5e-3,
             planes_lr=1.6e-2,
             ocd_lr=5e-5,
-            scales_lr=0.012,  # there are nearly as many points as Gaussians from the start
             decay_steps=2400,  # motion would end half learned if its rates fell to their end within the run
         ),
         # Births leave the image nearly as it is. Nothing is carried off: before its motion is learned, what moves is
