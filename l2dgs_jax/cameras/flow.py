@@ -8,6 +8,7 @@ from jaxtyping import Float, Float32, UInt8
 
 BLUR = 1.0  # standard deviation in pixels of what takes noise off before matching
 LOST = 3.0  # pixels from where flow returns to that void a match
+REFINEMENTS = 10  # of smooth flow in the frames, each of so many steps
 
 
 class Matches(NamedTuple):
@@ -42,6 +43,25 @@ def optical_flow(
     search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     search.setFinestScale(finest_scale)
     return search.calc(first, second, None)  # type: ignore[call-overload]
+
+
+def smooth_flow(
+    first: UInt8[np.ndarray, "H W"], second: UInt8[np.ndarray, "H W"], size: float
+) -> Float32[np.ndarray, "H W 2"]:
+    """Dense optical flow that follows what patches lose, as what turns or is thin, but blurs the edges of what moves.
+
+    It minimises DeepFlow's energy (ICCV 2013, without its matches) in pictures of `size` times the frames', and is
+    refined in these: the smaller, the larger are the motions that it follows, and the fewer the details.
+    """
+    height, width = first.shape
+    small = max(round(size * width), 1), max(round(size * height), 1)
+    smaller = (cv2.resize(picture, small, interpolation=cv2.INTER_AREA) for picture in (first, second))
+    flow = cv2.optflow.createOptFlow_DeepFlow().calc(*smaller, None)  # type: ignore[call-overload]
+    flow = cv2.resize(flow, (width, height)) * np.array([width, height], np.float32) / np.array(small, np.float32)
+    refinement = cv2.VariationalRefinement.create()
+    refinement.setFixedPointIterations(REFINEMENTS)
+    refinement.setSorIterations(REFINEMENTS)
+    return refinement.calc(first, second, flow)
 
 
 def pixel_indices(height: int, width: int) -> Float32[np.ndarray, "H W 2"]:

@@ -3,7 +3,7 @@
 from typing import Any
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
 from l2dgs_jax.config import Config
 from l2dgs_jax.data.dataset import Split
@@ -29,15 +29,28 @@ def next_batch(split: Split, config: Config, step: int, flows: Flows | None) -> 
         return batch
     valid = np.ones(batch.images.shape[:-1], bool) if batch.valid is None else batch.valid
     rows: Any = (*batch.cameras, batch.images, valid)
+    shares = _shares_between(split, flows, config.inbetweens)
     chances, parts = np.random.default_rng((seed % 2**64, step, 1)).random((2, config.batch_size))
     for row, frame in enumerate(indices.tolist()):
-        if chances[row] < config.inbetweens and flows.following[frame] != frame:
+        if chances[row] < shares[frame]:
             view = draw(split, flows, frame, float(parts[row]))
             for stack, own in zip(rows, (*view.camera, view.image, view.valid), strict=True):
                 stack[row] = own
             if batch.depths is not None:
                 batch.depths[row] = 0  # nobody knows it between frames
     return batch._replace(valid=valid)  # type: ignore[arg-type]
+
+
+def _shares_between(split: Split, flows: Flows, share: float) -> Float[np.ndarray, " F"]:
+    """How often each frame gives way to a view between it and the following one.
+
+    The longer the time between them, the more can happen in it: the odds are those of `share` for the mean of such
+    times, and in proportion to them. A frame that none follows never does.
+    """
+    times = np.asarray(split.cameras.time, np.float64)
+    gaps = times[flows.following] - times
+    odds = share * gaps * np.count_nonzero(gaps) / max(gaps.sum(), 1e-9)
+    return odds / np.maximum(1 - share + odds, 1e-9)
 
 
 def load_batch(split: Split, indices: Int[np.ndarray, " V"]) -> Batch:

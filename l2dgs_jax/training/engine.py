@@ -89,7 +89,7 @@ def run(members: Sequence[Member], pair_capacity: int | None = None, mesh: Mesh 
     values = devices.shard({name: _stack(column) for name, column in columns.items()}, mesh, MEMBERS)
 
     splits = {id(member.split): member.split for member in members}
-    flows = {key: neighbour_flows(split) if config.inbetweens else None for key, split in splits.items()}
+    flows = {key: neighbour_flows(split, filled=True) if config.inbetweens else None for key, split in splits.items()}
     steps = range(start, config.steps)
     read = prefetch(
         lambda step: _stack([next_batch(m.split, m.config, step, flows[id(m.split)]) for m in members]), steps

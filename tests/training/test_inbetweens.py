@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from tiny_training import assert_equal_states, finish, make_dataset, state_of, tiny
 
 from l2dgs_jax.cameras.geometry import between, camera_centres
-from l2dgs_jax.data import Split
+from l2dgs_jax.data import Split, load_dataset
 from l2dgs_jax.training import engine, initial_state
 from l2dgs_jax.training.batching import load_batch, next_batch, view_indices
 from l2dgs_jax.training.flows import neighbour_flows
@@ -47,7 +47,7 @@ def split():
 
 @pytest.fixture(scope="module")
 def flows(split):
-    return neighbour_flows(split)
+    return neighbour_flows(split, filled=True)
 
 
 def test_frames_follow_each_other_in_time(flows):
@@ -115,7 +115,34 @@ def test_of_several_cameras_the_nearest_one_follows():
 def test_frames_that_do_not_match_are_not_mixed():
     noise = np.random.default_rng(0).uniform(0, 0.3, (FRAMES, HEIGHT, WIDTH, 3)).astype(np.float16)
     cameras = Camera(*(x[:FRAMES] for x in make_dataset().train.cameras))
-    np.testing.assert_array_equal(neighbour_flows(Split(tuple("abcde"), cameras, noise)).following, range(FRAMES))
+    np.testing.assert_array_equal(
+        neighbour_flows(Split(tuple("abcde"), cameras, noise), filled=True).following, range(FRAMES)
+    )
+
+
+def test_after_a_cut_nothing_is_mixed(split):
+    images = split.images.copy()
+    images[2] = images[2, ::-1, ::-1] ** 2  # the last one in time
+    following = neighbour_flows(dataclasses.replace(split, images=images), filled=True).following
+    np.testing.assert_array_equal(following, [4, 3, 2, 0, 4])
+
+
+def test_smooth_flow_finds_what_patches_lose():
+    """Of every fourth frame of a real clip, the frames in the middle are drawn."""
+    whole = load_dataset("demo").train
+    order = np.argsort(whole.cameras.time)[:17]
+    kept = order[::4]
+    few = Split(tuple(map(str, kept)), Camera(*(x[kept] for x in whole.cameras)), whole.images[kept])
+
+    def right(filled):
+        flows, shares = neighbour_flows(few, filled=filled), []
+        for frame, middle in enumerate(order[2::4]):
+            view = draw(few, flows, frame, part=0.5)
+            apart = np.abs(view.image.astype(float) - whole.images[middle]).mean(-1)
+            shares.append(np.mean(view.valid & (apart < 0.02)))
+        return np.mean(shares)
+
+    assert right(filled=True) > 1.2 * right(filled=False)
 
 
 def test_cameras_between_cameras():
@@ -156,6 +183,21 @@ def test_batches_mix_frames_and_views_between_them(split, flows):
                 assert not batch.valid[row].all()
     # Of five frames the last has none to follow it.
     assert 0.4 < np.mean(kinds) < 0.8
+
+
+def test_more_is_drawn_where_more_time_passes(split, flows):
+    times = np.array([0.0, 0.1, 0.2, 0.4, 1.0], np.float32)  # of the frames in order; by index they are 1, 3, 0, 4, 2
+    cameras = split.cameras._replace(time=times[[2, 0, 4, 1, 3]])
+    uneven = dataclasses.replace(split, cameras=cameras)
+    counts = np.zeros((2, FRAMES))
+    for step in range(400):
+        batch = next_batch(uneven, tiny(inbetweens=0.4, batch_size=2), step, flows)
+        between_frames = batch.cameras.time != cameras.time[batch.frames]
+        np.add.at(counts, (between_frames.astype(int), batch.frames), 1)
+    share = counts[1] / counts.sum(0)
+    assert share[2] == 0  # the last
+    gaps = np.array([0.2, 0.1, 0, 0.1, 0.6])  # by index, 0.25 in the mean
+    np.testing.assert_allclose(share, 0.4 * gaps / (0.6 * 0.25 + 0.4 * gaps), atol=0.1)
 
 
 def test_without_any_the_frames_are_all_there_is(split):
