@@ -14,7 +14,7 @@ from l2dgs_jax.training.flows import neighbour_flows
 def steadiness(welllit: Float[np.ndarray, "F H W 3"], split: Split, gain: float | None) -> dict:
     """The warping error (arXiv 1808.00449) of views that follow each other in time, of the cameras next to each other.
 
-    It counts where optical flow there and back agree, between views of which that is most pixels.
+    It counts where optical flow there and back agree, between views that show most of the same.
 
     Args:
         welllit: the well-lit images of the split's views.

@@ -17,8 +17,8 @@ from l2dgs_jax.data.dataset import Split
 from l2dgs_jax.training.flows import Flows
 from l2dgs_jax.types import Camera
 
-DISAGREEMENT = 5.0  # of the two warped frames, in medians over the picture, that voids a pixel
-LEVELS = 2 / 255  # by which they may differ in any case, sRGB
+DISAGREEMENT = 2.0  # of the two warped frames, in medians over the picture, that voids a pixel
+LEVELS = 1 / 255  # by which they may differ in any case, sRGB
 
 
 class View(NamedTuple):
