@@ -5,6 +5,7 @@ grows it runs from where the infinitely far would be along the epipolar line tow
 Zisserman, Multiple View Geometry, section 9).
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -27,13 +28,14 @@ class EpipolarGeometry(NamedTuple):
     e: Float[np.ndarray, "*K 3"]
 
 
-def epipolar_geometry(cameras: Camera, first: int, second: int) -> EpipolarGeometry:
-    """The geometry from the view `first` to the view `second` of a batch of cameras."""
+def epipolar_geometry(cameras: Camera, first: int, second: int | Sequence[int]) -> EpipolarGeometry:
+    """The geometry from the view `first` to the view or views `second` of a batch of cameras."""
     to_second = np.asarray(cameras.viewmat[second], np.float64) @ np.linalg.inv(
         np.asarray(cameras.viewmat[first], np.float64)
     )
     K_first, K_second = (np.asarray(cameras.K[index], np.float64) for index in (first, second))
-    return EpipolarGeometry(K_second @ to_second[:3, :3] @ np.linalg.inv(K_first), K_second @ to_second[:3, 3])
+    H = K_second @ to_second[..., :3, :3] @ np.linalg.inv(K_first)
+    return EpipolarGeometry(H, (K_second @ to_second[..., :3, 3:])[..., 0])
 
 
 def project(

@@ -1,5 +1,7 @@
 """Dense matches between frames, by optical flow on brightened copies."""
 
+import functools
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import cv2
@@ -7,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
 BLUR = 1.0  # standard deviation in pixels of what takes noise off before matching
+REMEMBERED = 48  # pairs of frames whose flow is kept
 LOST = 3.0  # pixels from where flow returns to that void a match
 REFINEMENTS = 10  # of smooth flow in the frames, each of so many steps
 
@@ -78,3 +81,17 @@ def match(there: Float32[np.ndarray, "H W 2"], back: Float32[np.ndarray, "H W 2"
     left = (ends < 0).any(-1) | (ends > (width - 1, height - 1)).any(-1)
     errors = np.where(left, np.float32(2 * LOST), np.linalg.norm(there + returned, axis=-1))
     return Matches(ends + np.float32(0.5), errors.astype(np.float32))  # pixel centres lie at +0.5
+
+
+def matcher(greys: UInt8[np.ndarray, "F H W"]) -> Callable[[int, Sequence[int]], Matches]:
+    """A function of a frame and others that finds its matches with them.
+
+    Flow is kept of some pairs: in the order of time most come back, the other way round, before they are forgotten.
+    """
+    flow = functools.lru_cache(REMEMBERED)(lambda first, second: optical_flow(greys[first], greys[second]))
+
+    def matches(frame: int, others: Sequence[int]) -> Matches:
+        found = [match(flow(frame, other), flow(other, frame)) for other in others]
+        return Matches(*map(np.stack, zip(*found, strict=True)))
+
+    return matches

@@ -4,7 +4,7 @@ from typing import TypeVar
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 from scipy.spatial.transform import Rotation, Slerp
 
 from l2dgs_jax.types import Camera
@@ -28,6 +28,18 @@ def project_points(
     depth = local[..., 2]
     seen = np.einsum("...ij,...j->...i", Ks[..., :2, :], local)
     return seen / np.where(depth > 0, depth, np.nan)[..., None], depth
+
+
+def points_inside(
+    points: Float[np.ndarray, "P 3"],
+    viewmat: Float[np.ndarray, "4 4"],
+    K: Float[np.ndarray, "3 3"],
+    size: tuple[int, ...],
+) -> tuple[Bool[np.ndarray, " P"], Float[np.ndarray, "S 2"], Float[np.ndarray, " S"]]:
+    """Which points, world units, a picture of that width and height shows if none is hidden; their pixels, their depths."""
+    pixels, depth = project_points(points, viewmat, K)
+    inside: np.ndarray = np.all((pixels >= 0) & (pixels < size), axis=-1)  # not where they are NaN
+    return inside, pixels[inside], depth[inside]
 
 
 def mean_up(viewmats: Float[np.ndarray, "F 4 4"]) -> Float[np.ndarray, "3"]:

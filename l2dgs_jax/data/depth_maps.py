@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Float32
 
-from l2dgs_jax.cameras.geometry import project_points
+from l2dgs_jax.cameras.geometry import points_inside
 from l2dgs_jax.data.images import read_image
 from l2dgs_jax.data.parsing import read_array
 from l2dgs_jax.data.pictures import Picture, by_name, only, scales
@@ -82,11 +82,11 @@ def agreement(depths: Float32[np.ndarray, "F H W"], cameras: Camera, points: Flo
     found = []
     for frame in range(0, len(depths), -(-len(depths) // LOOKED_AT)):
         depth = depths[frame]
-        pixels, distances = project_points(points, cameras.viewmat[frame], cameras.K[frame])  # type: ignore[arg-type]
-        inside = ((pixels >= 0) & (pixels < (width, height))).all(-1)
-        columns, rows = pixels[inside].astype(int).T
+        viewmat, K = (np.asarray(x[frame]) for x in (cameras.viewmat, cameras.K))
+        _, pixels, distances = points_inside(points, viewmat, K, (width, height))
+        columns, rows = pixels.astype(int).T
         told = depth[rows, columns]
-        pairs = np.log(np.stack([told, distances[inside]])[:, told > 0])
+        pairs = np.log(np.stack([told, distances])[:, told > 0])
         if pairs.shape[1] > 1 and pairs.std(1).all():
             found.append(np.corrcoef(pairs)[0, 1])
     return float(np.median(found)) if found else 0.0

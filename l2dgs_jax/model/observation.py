@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
-from l2dgs_jax.cameras.geometry import project_points
+from l2dgs_jax.cameras.geometry import points_inside
 from l2dgs_jax.data.stacks import pixel_mean, stacked
 from l2dgs_jax.runtime.prefetch import prefetch
 from l2dgs_jax.types import Camera
@@ -81,13 +81,12 @@ def _seen(
     viewmat, K, image = np.asarray(cameras.viewmat[frame]), cameras.K[frame], images[frame]
     if blur:
         image = cv2.blur(image.astype(np.float32), (3, 3))
-    pixels, _ = project_points(points, viewmat, np.asarray(K))
-    inside = ((pixels >= 0) & (pixels < image.shape[1::-1])).all(-1)
-    column, row = np.where(inside, pixels.T, 0).astype(int)
-    if valid is not None:
-        inside[inside] = valid[frame][row[inside], column[inside]]
+    inside, pixels, _ = points_inside(points, viewmat, np.asarray(K), image.shape[1::-1])
+    column, row = pixels.astype(int).T
     colors = np.full((len(points), 3), np.nan, image.dtype)
-    colors[inside] = image[row[inside], column[inside]]
+    colors[inside] = image[row, column]
+    if valid is not None:
+        colors[np.flatnonzero(inside)[~valid[frame][row, column]]] = np.nan
     return colors
 
 

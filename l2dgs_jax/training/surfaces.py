@@ -5,7 +5,6 @@ training. Where cameras are known, optical flow tells how far away almost every 
 that the frames show (as in EDGS, arXiv 2504.13204, whose matches come from a network).
 """
 
-import functools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -20,8 +19,8 @@ from l2dgs_jax.cameras.epipolar import (
     project,
     proposed,
 )
-from l2dgs_jax.cameras.flow import brightened, match, optical_flow, pixel_indices
-from l2dgs_jax.cameras.geometry import camera_centres, project_points
+from l2dgs_jax.cameras.flow import brightened, matcher, pixel_indices
+from l2dgs_jax.cameras.geometry import camera_centres, points_inside
 from l2dgs_jax.data.dataset import Split
 from l2dgs_jax.runtime.prefetch import prefetch
 from l2dgs_jax.types import Camera
@@ -82,22 +81,17 @@ def depth_maps(points: Float[np.ndarray, "P 3"], split: Split) -> list[DepthMap]
     cameras, greys = split.cameras, brightened(split.images)
     height, width = greys.shape[1:]
     some = points[:: -(-len(points) // LOOKED_AT)].astype(np.float64)
-    flow = functools.lru_cache(maxsize=48)(lambda first, second: optical_flow(greys[first], greys[second]))
+    matches = matcher(greys)
 
     def depths_of(frame: int) -> DepthMap:
         viewmat, K = (np.asarray(x[frame], np.float64) for x in (cameras.viewmat, cameras.K))
-        seen, depth = project_points(some, viewmat, K)
-        inside = ((seen >= 0) & (seen < (width, height))).all(-1)
-        seen, depth = seen[inside], depth[inside]
+        _, seen, depth = points_inside(some, viewmat, K, (width, height))
         others = _partners(cameras, seen, depth, frame, FARTHEST * width)
         if not others:
             return DepthMap(viewmat, K, np.full((height, width), np.nan, np.float32))
-        geometry = EpipolarGeometry(
-            *map(np.stack, zip(*(epipolar_geometry(cameras, frame, other) for other in others), strict=True))
-        )
-        matches = [match(flow(frame, other), flow(other, frame)) for other in others]
-        ends, errors = map(np.stack, zip(*matches, strict=True))
+        ends, errors = matches(frame, others)
         nearest, farthest = np.quantile(depth, (0.01, 0.99))
+        geometry = epipolar_geometry(cameras, frame, others)
         inverse = triangulated(geometry, ends, errors < RETURNED, (DEPTHS[0] / farthest, DEPTHS[1] / nearest))
         if split.valid is not None:
             inverse[~split.valid[frame]] = np.nan
@@ -237,7 +231,5 @@ def _seen(
     points: Float[np.ndarray, "P 3"], depths: DepthMap
 ) -> tuple[Bool[np.ndarray, " P"], Int[np.ndarray, "2 S"], Float[np.ndarray, " S"]]:
     """Which points lie inside a frame's picture, in which columns and rows, and their depths."""
-    height, width = depths.inverse.shape
-    pixels, depth = project_points(points, depths.viewmat, depths.K)
-    inside: np.ndarray = np.all((pixels >= 0) & (pixels < (width, height)), axis=-1)
-    return inside, pixels[inside].astype(int).T, depth[inside]
+    inside, pixels, depth = points_inside(points, depths.viewmat, depths.K, depths.inverse.shape[::-1])
+    return inside, pixels.astype(int).T, depth

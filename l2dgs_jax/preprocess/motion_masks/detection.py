@@ -6,7 +6,6 @@ along them, because the views are many and the sparse points bound the depth. Ho
 each pixel by whether flow there and back returns, and for each view by how well the still bulk of the scene fits.
 """
 
-import functools
 from collections.abc import Iterator
 
 import cv2
@@ -14,8 +13,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
 from l2dgs_jax.cameras.epipolar import EpipolarGeometry, epipolar_geometry, project, static_residuals
-from l2dgs_jax.cameras.flow import LOST, Matches, brightened, match, optical_flow, pixel_indices
-from l2dgs_jax.cameras.geometry import project_points
+from l2dgs_jax.cameras.flow import LOST, Matches, brightened, matcher, pixel_indices
+from l2dgs_jax.cameras.geometry import points_inside
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.types import Camera
 
@@ -49,19 +48,14 @@ def moving_masks(
     if len(np.unique(cameras.time)) < 2:
         raise UserError("all frames are of one instant; expected frames of at least two, to see motion between them")
     greys = brightened(images)
-    # In the order of time most pairs come back, the other way round, before they are forgotten.
-    flow = functools.lru_cache(maxsize=48)(lambda first, second: optical_flow(greys[first], greys[second]))
+    matches = matcher(greys)
     height, width = greys.shape[1:]
     for frame in np.argsort(cameras.time, kind="stable").tolist():
         others = partners(cameras, points, (width, height), frame)
         if others:
-            geometries = [epipolar_geometry(cameras, frame, other) for other in others]
-            matches = [match(flow(frame, other), flow(other, frame)) for other in others]
-            score = contradiction(
-                EpipolarGeometry(*map(np.stack, zip(*geometries, strict=True))),
-                Matches(*map(np.stack, zip(*matches, strict=True))),
-                inverse_depths(cameras, points, (width, height), frame),
-            )
+            geometry = epipolar_geometry(cameras, frame, others)
+            depths = inverse_depths(cameras, points, (width, height), frame)
+            score = contradiction(geometry, matches(frame, others), depths)
             yield frame, segmented(score, greys[frame])
         else:
             yield frame, np.zeros((height, width), bool)
@@ -160,6 +154,4 @@ def _visible(
 ) -> tuple[Float[np.ndarray, "V 2"], Float[np.ndarray, " V"]]:
     """Pixels and depths of the points within a frame's picture."""
     viewmat, K = (np.asarray(x[frame], np.float64) for x in (cameras.viewmat, cameras.K))
-    pixels, depth = project_points(points.astype(np.float64), viewmat, K)
-    inside = ((pixels >= 0) & (pixels < size)).all(-1)
-    return pixels[inside], depth[inside]
+    return points_inside(points.astype(np.float64), viewmat, K, size)[1:]
