@@ -36,7 +36,7 @@ def points_inside(
     K: Float[np.ndarray, "3 3"],
     size: tuple[int, ...],
 ) -> tuple[Bool[np.ndarray, " P"], Float[np.ndarray, "S 2"], Float[np.ndarray, " S"]]:
-    """Which points, world units, a picture of that width and height shows if none is hidden; their pixels and depths."""
+    """Which points, world units, a picture of that width and height shows, none being hidden; their pixels, depths."""
     pixels, depth = project_points(points, viewmat, K)
     inside: np.ndarray = np.all((pixels >= 0) & (pixels < size), axis=-1)  # not where they are NaN
     return inside, pixels[inside], depth[inside]
