@@ -1,0 +1,66 @@
+"""How much of a frame its neighbours tell: `python -m experiments.quality.flow_accuracy SCENE... [--downscale K]`.
+
+Every second frame is drawn from those before and after it, as training draws views between frames. A pixel comes out
+right if it differs from the frame by less than three medians of what pixels differ by, both blurred by a pixel.
+Counted is what moves, by the masks of the scene or, where it has none, by computed ones.
+"""
+
+import argparse
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float32
+
+from l2dgs_jax.data import Split, load_dataset
+from l2dgs_jax.preprocess.motion_masks import compute_masks
+from l2dgs_jax.training.flows import neighbour_flows
+from l2dgs_jax.training.inbetweens import draw
+from l2dgs_jax.types import Camera
+
+NEAR = 3.0  # medians
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scenes", type=Path, nargs="+")
+    parser.add_argument("--downscale", type=int, default=1)
+    options = parser.parse_args()
+    for scene in options.scenes:
+        dataset = load_dataset(scene, options.downscale)
+        split = dataset.train
+        moving = compute_masks(dataset)[: len(split.names)] if split.masks is None else split.masks
+        order = np.argsort(split.cameras.time, kind="stable")
+        for name, filled in (("by patches", False), ("with smooth flow", True)):
+            right, wrong = shares(split, moving, order, filled)
+            print(f"{scene.name}, {name}: {right:.0%} of what moves comes out right, {wrong:.0%} wrong")
+
+
+def shares(split: Split, moving: Bool[np.ndarray, "F H W"], order: np.ndarray, filled: bool) -> np.ndarray:
+    """Parts of what moves that come out right and wrong, in the mean of the frames that are drawn."""
+    kept = order[::2]
+    flows = neighbour_flows(_some(split, kept), filled=filled)
+    times, found = split.cameras.time, []
+    for index, middle in enumerate(order[1 : 2 * len(kept) - 2 : 2]):
+        first, second = kept[index : index + 2]
+        part = float((times[middle] - times[first]) / (times[second] - times[first]))
+        view = draw(_some(split, kept), flows, index, part)
+        apart = np.abs(_blurred(view.image) - _blurred(split.images[middle])).mean(-1)
+        right = apart < NEAR * np.median(apart[view.valid])
+        counted = moving[middle]
+        if counted.any():
+            found.append([(view.valid & is_so & counted).sum() / counted.sum() for is_so in (right, ~right)])
+    return np.mean(found, axis=0)
+
+
+def _some(split: Split, frames: np.ndarray) -> Split:
+    cameras = Camera(*(np.asarray(x)[frames] for x in split.cameras))
+    return Split(tuple(split.names[frame] for frame in frames), cameras, split.images[frames])
+
+
+def _blurred(image: np.ndarray) -> Float32[np.ndarray, "H W 3"]:
+    return cv2.GaussianBlur(image.astype(np.float32), (0, 0), 1.0)
+
+
+if __name__ == "__main__":
+    main()
