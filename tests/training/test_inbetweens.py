@@ -13,7 +13,7 @@ from l2dgs_jax.cameras.geometry import between, camera_centres
 from l2dgs_jax.data import Split, load_dataset
 from l2dgs_jax.training import engine, initial_state
 from l2dgs_jax.training.batching import load_batch, next_batch, view_indices
-from l2dgs_jax.training.flows import neighbour_flows
+from l2dgs_jax.training.flows import Flows, neighbour_flows
 from l2dgs_jax.training.inbetweens import draw
 from l2dgs_jax.types import Camera
 
@@ -93,6 +93,20 @@ def test_what_only_one_frame_shows_is_left_out(split):
     assert view.valid[moved].mean() < 0.1
     assert view.valid[:16].mean() > 0.7
     assert not view.image[~view.valid].any()
+
+
+def test_edges_may_be_a_pixel_off(split):
+    rng = np.random.default_rng(0)
+    stripes = np.where(np.arange(WIDTH) // 16 % 2, 0.3, 0.1)[None, :, None] * np.ones((HEIGHT, 1, 3))
+    images = np.tile(stripes, (FRAMES, 1, 1, 1)) + rng.normal(0, 0.002, (FRAMES, HEIGHT, WIDTH, 3))
+    still = Flows(np.array([4, 3, 2, 0, 2]), np.zeros((FRAMES, 2, HEIGHT, WIDTH, 2), np.float16))
+    shares = []
+    for off in (1, 5):
+        images[0] = np.roll(images[3], off, axis=1)
+        view = draw(dataclasses.replace(split, images=images.astype(np.float16)), still, frame=3, part=0.5)
+        shares.append(view.valid[:, 8:-8].mean())
+    assert shares[0] > 0.95
+    assert shares[1] < 0.8
 
 
 def test_pixels_that_are_not_valid_stay_so(split, flows):
