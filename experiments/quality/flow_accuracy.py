@@ -39,12 +39,13 @@ def main() -> None:
 def shares(split: Split, moving: Bool[np.ndarray, "F H W"], order: np.ndarray, filled: bool) -> np.ndarray:
     """Parts of what moves that come out right and wrong, in the mean of the frames that are drawn."""
     kept = order[::2]
-    flows = neighbour_flows(_some(split, kept), filled=filled)
+    few = _some(split, kept)
+    flows = neighbour_flows(few, filled=filled)
     times, found = split.cameras.time, []
     for index, middle in enumerate(order[1 : 2 * len(kept) - 2 : 2]):
         first, second = kept[index : index + 2]
         part = float((times[middle] - times[first]) / (times[second] - times[first]))
-        view = draw(_some(split, kept), flows, index, part)
+        view = draw(few, flows, index, part)
         apart = np.abs(_blurred(view.image) - _blurred(split.images[middle])).mean(-1)
         right = apart < NEAR * np.median(apart[view.valid])
         counted = moving[middle]
