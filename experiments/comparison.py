@@ -1,7 +1,7 @@
-"""`python -m experiments.comparison STUDY OUT.html`: what the methods of a study made of the same views, side by side.
+"""`python -m experiments.comparison STUDY OUT.html`: the same views by all methods of a study, side by side.
 
-A page that holds everything: for every scene the dark input, each variant's well-lit view and the truth, with a slider
-over time, a curtain between any two of them, and an enlarged part of all. STUDY is a folder that `sweep`, or one
+Makes a self-contained page: for every scene the dark input, each variant's well-lit view and the ground truth, with a
+slider over time, a curtain between any two of them, and an enlarged part of all. STUDY is a folder that `sweep`, or one
 of the scripts for the paper's tables, has filled.
 """
 
@@ -27,8 +27,8 @@ from l2dgs_jax.runtime.pages import data_url
 from l2dgs_jax.study import report
 from l2dgs_jax.types import Camera
 
-QUALITY = 92  # of JPEG
-INPUT, TRUTH = "input", "truth"  # what the page calls the pictures that no member made
+JPEG_QUALITY = 92
+INPUT, TRUTH = "input", "truth"  # names on the page of the pictures that no member rendered
 
 
 @dataclass(frozen=True)
@@ -36,9 +36,9 @@ class Options:
     """Compare the methods of a study on a page.
 
     Attributes:
-        study: folder that `sweep` or a table's script has filled.
+        study: folder that `sweep` or a script for the paper's tables has filled.
         output: the page, .html.
-        views: how many held-out views of each scene, spread over time.
+        views: number of held-out views of each scene, spread over time.
     """
 
     study: tyro.conf.Positional[Path]
@@ -59,7 +59,7 @@ def main(arguments: Sequence[str]) -> None:
 
 
 def _members(study: Path) -> dict[str, dict[str, Member]]:
-    """The members of the first seed, by scene and by what the page calls them."""
+    """The members with the first seed, by scene and by their names on the page."""
     path, what = study / report.JSON, "the results of a study that has ended"
     members = value(path, read_json(path, what), "members", list)
     keys = {"name", "scene", "variant", "varied", "ended"}
@@ -99,7 +99,7 @@ def _scene(study: Path, scene: str, members: dict[str, Member], count: int) -> d
 
 
 def _url(picture: UInt8[np.ndarray, "H W 3"]) -> str:
-    return data_url(encode_jpeg(picture, QUALITY), "picture.jpg")
+    return data_url(encode_jpeg(picture, JPEG_QUALITY), "picture.jpg")
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
-"""`python -m experiments.lowlight OUT [--scenes SCENE ...]`: how well the low-light input is explained (section 5).
+"""`python -m experiments.lowlight OUT [--scenes SCENE ...]`: how well the low-light input is estimated (section 5).
 
-Scores are of the estimate of held-out low-light views against these views: by scene and variant, and means over the
-scenes beside the paper's. A variant that learns from brightened frames makes no such estimate. OUT/lowlight.md has the
+Scores compare the estimates of held-out low-light views with these views, by scene and variant; means over the scenes
+stand beside the paper's. A variant that learns from brightened frames makes no such estimate. OUT/lowlight.md has the
 table, OUT/lowlight.json the same numbers.
 """
 
@@ -24,7 +24,7 @@ def main(arguments: Sequence[str]) -> None:
 
 
 def lowlight(scores: dict[str, Any]) -> Cells:
-    """Those of the low-light estimate, by region; none where there is no such estimate."""
+    """The scores of the low-light estimate, by region; empty if there is no such estimate."""
     return scores.get("lowlight_regions", {}) | {"overall": scores.get("lowlight", {})}
 
 

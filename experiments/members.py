@@ -1,4 +1,4 @@
-"""The members of a study, as its `results.json` lists them: what they are called, and which of them count."""
+"""The members of a study, as listed in its `results.json`: their labels, and which of them count."""
 
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
@@ -10,7 +10,7 @@ Member = dict[str, Any]
 
 
 def labels(members: Sequence[Member]) -> dict[str, str]:
-    """What tells a member from others of its scene and seed, by its name: the variant, and what a grid varies in it."""
+    """Labels by members' names: the variant, and the settings that a grid varies in it, but not scene and seed."""
     values: dict[tuple[str, str], set[str]] = defaultdict(set)
     for member in members:
         for setting, value in member["varied"].items():
@@ -24,5 +24,5 @@ def labels(members: Sequence[Member]) -> dict[str, str]:
 
 
 def left_out(members: Iterable[Member]) -> list[str]:
-    """Members whose scores are those of a scene half trained, which belong in no mean, and how they ended."""
+    """Members that did not finish, whose scores belong in no mean, and how they ended."""
     return [f"{member['name']} ({member['ended']})" for member in members if member["ended"] != FINISHED]

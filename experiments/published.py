@@ -1,18 +1,18 @@
-"""The figures of the paper (L2DGS, CVPR 2026) that the tables here are set beside."""
+"""Figures of the paper (L2DGS, CVPR 2026), which the tables show beside our own."""
 
 REGIONS = ("dynamic", "static", "overall")
-MEASURES = ("psnr", "ssim", "lpips_alex")  # the paper does not say with which network it takes LPIPS
+MEASURES = ("psnr", "ssim", "lpips_alex")  # the paper does not say which network it uses for LPIPS
 
-Cells = dict[str, dict[str, float]]  # measure by region
+Cells = dict[str, dict[str, float]]  # scores by region and measure
 
 
 def _cells(text: str) -> Cells:
-    """Figures of one row, in the order of the paper's columns."""
+    """Scores of one row, from its figures in the order of the paper's columns."""
     figures = iter(map(float, text.split()))
     return {region: {measure: next(figures) for measure in MEASURES} for region in REGIONS}
 
 
-# Table 1, by the name that its scene's folder is expected to have.
+# Table 1, by the expected name of each scene's folder.
 TABLE1 = {
     "mochi": {
         "AlethNeRF": _cells("14.32 0.50 0.17 15.53 0.66 0.23 14.95 0.59 0.40"),
@@ -64,7 +64,7 @@ TABLE3 = {
     "whole": _cells("16.73 0.64 0.07 13.86 0.71 0.12 14.68 0.69 0.18"),
 }
 
-# The last paragraph of section 5: the estimate of the low-light input against that input.
+# From the last paragraph of section 5: scores of the estimate of the low-light input against that input.
 LOWLIGHT: Cells = {
     "dynamic": {"psnr": 31.28, "ssim": 0.92},
     "static": {"psnr": 32.96, "ssim": 0.96},

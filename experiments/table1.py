@@ -1,7 +1,8 @@
-"""`python -m experiments.table1 OUT [--scenes SCENE ...]`: methods by scenes and regions, as the paper's Table 1.
+"""`python -m experiments.table1 OUT [--scenes SCENE ...]`: methods by scenes and regions, as in the paper's Table 1.
 
-Scores are of held-out well-lit views. OUT/table1.md has a table for each scene, beside the paper's where it is one of
-its scenes; OUT/table1.json the same numbers. PSNR after one global gain tells what is too dark from what is wrong.
+Scores are those of held-out well-lit views. OUT/table1.md has a table for each scene, with the paper's figures if it is
+one of its scenes; OUT/table1.json has the same numbers. PSNR after one global gain shows whether an image is only too
+dark, or wrong.
 """
 
 import sys

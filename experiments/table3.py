@@ -1,7 +1,7 @@
-"""`python -m experiments.table3 OUT [--scenes SCENE ...]`: the eleven ablations of the paper's Table 3, and none.
+"""`python -m experiments.table3 OUT [--scenes SCENE ...]`: the eleven ablations of Table 3, and the whole method.
 
-Scores are means over the scenes of those of held-out well-lit views, the paper's in brackets. OUT/table3.md has the
-table, OUT/table3.json the same numbers.
+Scores are those of held-out well-lit views, as means over the scenes; the paper's are in brackets. OUT/table3.md has
+the table, OUT/table3.json the same numbers.
 """
 
 import sys

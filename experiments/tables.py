@@ -1,4 +1,4 @@
-"""What the scripts for the paper's tables share: a study that is run or gone on with, and its scores by region."""
+"""What the scripts for the paper's tables share: running or resuming a study, and its scores by region."""
 
 import dataclasses
 import json
@@ -25,8 +25,8 @@ from l2dgs_jax.study.spec import Spec, read
 
 STUDIES = Path(__file__).parent / "studies"
 TITLES = {"psnr": "PSNR", "ssim": "SSIM", "lpips_alex": "LPIPS", "psnr_gain": "PSNR after gain"}
-CONVENTION: Convention = "paper"  # of regions, with LPIPS; PSNR and SSIM are the same by the usual one
-# Steps and sizes of a smoke run; the number of steps is that of each stage that a member has.
+CONVENTION: Convention = "paper"  # for scoring regions with LPIPS; for PSNR and SSIM it is the same as the default
+# Settings of a smoke run; QUICK_STEPS is the number of steps of each stage that a member has.
 QUICK_STEPS = 3
 QUICK = {"model.plane_size": 8, "model.hidden": 8, "model.tracks": False, "model.surfaces": False}
 QUICK |= {"inbetweens": 0.0, "density.stop": 0}
@@ -34,14 +34,14 @@ QUICK |= {"inbetweens": 0.0, "density.stop": 0}
 
 @dataclass(frozen=True)
 class Options:
-    """Train what a table compares, and set it beside the paper's figures.
+    """Train what a table compares, and show it beside the paper's figures.
 
     Attributes:
-        output: folder for the study and the table; the same command goes on where it was interrupted.
-        study: TOML file to run in place of the one in experiments/studies; the names of its variants are the rows.
-        scenes: folders of scenes in place of the study's.
-        lpips_alex: files with the weights of LPIPS, as for `evaluate`; without any its columns stay empty.
-        quick: a few steps on the first scene, to see that all of it works; its scores mean nothing.
+        output: folder for the study and the table; the same command continues where it was interrupted.
+        study: TOML file to use instead of the one in experiments/studies; the names of its variants are the rows.
+        scenes: folders of scenes to use instead of the study's.
+        lpips_alex: files with the weights of LPIPS, as for `evaluate`; without them its columns may stay empty.
+        quick: only a few steps on the first scene, to check that everything works; the scores mean nothing.
     """
 
     output: tyro.conf.Positional[Path]
@@ -52,7 +52,7 @@ class Options:
 
 
 def trained(options: Options, study: str) -> list[Member]:
-    """The results of all members of a study, as `results.json` holds them.
+    """Run or resume a study; returns the results of all its members, as in `results.json`.
 
     Raises:
         UserError: as `run_study`, or weights of LPIPS cannot be read.
@@ -62,7 +62,7 @@ def trained(options: Options, study: str) -> list[Member]:
     scenes = [scene if scene == "demo" else str(Path(scene).absolute()) for scene in options.scenes]
     spec = read(options.study or STUDIES / study, scenes)
     spec = _quick(spec) if options.quick else spec
-    running.run_study(spec, options.output, resume=(options.output / running.PLANS).exists())
+    running.run_study(spec, options.output, resume=(options.output / running.PLANS_FILE).exists())
     if lpips:
         _score_again(options.output, lpips)
     return _members(options.output)
@@ -73,12 +73,12 @@ def _members(study: Path) -> list[Member]:
 
 
 def _score_again(study: Path, lpips: dict[Network, Lpips]) -> None:
-    """Score what is finished with LPIPS too, unless that was done before."""
+    """Score finished members with LPIPS too, unless that was done before."""
     members = _members(study)
     for member in members:
         if member["ended"] == report.FINISHED and member["scores"]["region_convention"] != CONVENTION:
             scores = evaluate(open_run(study / member["name"]), lpips=lpips, convention=CONVENTION)
-            path = study / member["name"] / report.RESULT
+            path = study / member["name"] / report.RESULT_FILE
             write_json(path, json.loads(path.read_text()) | {"scores": scores})
     report.write(study, [member["name"] for member in members])
 
@@ -100,7 +100,7 @@ def collect(members: Sequence[Member], cells: Callable[[dict[str, Any]], Cells])
 
     Args:
         members: of a study.
-        cells: takes them from all scores of a member.
+        cells: selects the scores for a table from all scores of a member.
     """
     names = labels(members)
     groups: dict[str, dict[str, list[Cells]]] = {}
@@ -118,12 +118,12 @@ def over_scenes(found: dict[str, dict[str, Cells]]) -> dict[str, Cells]:
 
 
 def welllit(scores: dict[str, Any]) -> Cells:
-    """Those of the well-lit views, by region; none where no truth is known."""
+    """The scores of the well-lit views, by region; empty without ground truth."""
     return scores.get("welllit", {})
 
 
 def means(scores: Iterable[Cells]) -> Cells:
-    """Means over members, each over those that have the region and the measure."""
+    """Means over members, for each region and measure over those that have it."""
     found: dict[str, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
     for cells in scores:
         for region, measures in cells.items():
@@ -137,7 +137,7 @@ def means(scores: Iterable[Cells]) -> Cells:
 
 
 def table(rows: Sequence[tuple[str, Sequence[Cells]]], measures: Sequence[str] = MEASURES) -> str:
-    """Markdown with a column for each region and measure; of several figures, all but the first are in brackets."""
+    """Markdown with a column for each region and measure; in a cell, all figures but the first are in brackets."""
     columns = [
         (region, measure)
         for region in REGIONS
@@ -160,7 +160,7 @@ def _text(value: float | None, measure: str) -> str:
 
 
 def write(options: Options, name: str, members: Sequence[Member], content: Any, markdown: str) -> None:
-    """Leave a table's numbers in NAME.json and itself, with what must be known of it, in NAME.md, and print it."""
+    """Write a table's numbers to NAME.json and the table with explanations to NAME.md, and print the latter."""
     conventions = {member["scores"]["region_convention"] for member in members if member["ended"] == report.FINISHED}
     if conventions:
         shown = " or ".join(sorted(conventions))

@@ -1,10 +1,11 @@
-"""Table 2 as a kit: a page to be judged without knowing what made what, and the table of the answers.
+"""The user study of Table 2: a page on which methods are judged blindly, and the table of the answers.
 
     python -m experiments.user_study page MEDIA study.html --seed 1     # MEDIA/METHOD/SCENE.mp4 (or .webm, .png ...)
     python -m experiments.user_study table study.key.json answers/*.json
 
-The page holds everything, works offline, and leaves each person's answers as a file of the browser. Methods are letters
-in it, dealt anew for every scene; which is which stands in the key file alone. Keep that from those who judge.
+The page is self-contained and works offline; each participant downloads their answers from it as a file. Methods are
+shown as letters, which are assigned at random for every scene; only the key file says which method is which. Do not
+give that file to the participants.
 """
 
 import hashlib
@@ -35,20 +36,21 @@ CRITERIA = (
 )
 RATINGS = (1, 5)
 SUFFIXES = (".mp4", ".webm", ".png", ".jpg", ".jpeg", ".webp")
-INPUT = "input"  # folder of MEDIA that is shown beside the others and not judged
+INPUT = "input"  # folder in MEDIA that is shown beside the methods but not judged
 RESAMPLES, COVERAGE = 10_000, 0.95
 NUMERALS = ("i", "ii", "iii", "iv", "v")
 
 
 @dataclass(frozen=True)
 class Page:
-    """Make a page from a folder for each method, in which each scene has one picture or video.
+    """Make a page from the folders of several methods, each with one picture or video of every scene.
 
     Attributes:
-        media: folder of the methods' folders; one called "input" is shown for comparison.
-        output: the page, .html; its key is written beside it.
-        seed: of the order of scenes, and of methods in each.
-        kind: choose the best result by each criterion, rate every one from 1 (poor) to 5 (best), or both.
+        media: folder that contains the methods' folders; one called "input" is shown for comparison.
+        output: the page, .html; its key file is written beside it.
+        seed: of the random order of scenes and of the methods in each.
+        kind: task of the participants, for each criterion: choose the best result ("binary"), rate every result from 1
+            (poor) to 5 (best) ("rating"), or both.
     """
 
     media: tyro.conf.Positional[Path]
@@ -59,14 +61,15 @@ class Page:
 
 @dataclass(frozen=True)
 class Table:
-    """Put answers together in the form of the paper's Table 2: percent of choices / mean rating.
+    """Summarise answers in the form of the paper's Table 2: percent of choices / mean rating.
 
-    In brackets, intervals of 95 % by bootstrap over the participants, as answers of one person belong together.
+    In brackets are 95 % confidence intervals by bootstrap over participants, because answers of one person are not
+    independent.
 
     Attributes:
-        key: file that `page` wrote.
-        answers: files that the page left, one for each person.
-        json: file for the numbers.
+        key: key file that `page` wrote.
+        answers: files downloaded from the page, one per participant.
+        json: file to write the numbers to.
     """
 
     key: tyro.conf.Positional[Path]
@@ -109,7 +112,7 @@ def make_page(options: Page) -> None:
         scenes.append({"name": name, "media": {k: data_url(path.read_bytes(), path.name) for k, path in shown.items()}})
     study = f"{options.output.stem}-{hashlib.sha256(json.dumps(key).encode()).hexdigest()[:8]}"
     data = {"study": study, "kind": options.kind, "criteria": CRITERIA, "letters": letters, "scenes": scenes}
-    with replacing(options.output) as temporary:  # neither is left without the other
+    with replacing(options.output) as temporary:  # both files are written, or none
         write_page(temporary, Path(__file__).with_suffix(".html"), data)
         write_json(key_file, {"study": study, "methods": methods, "key": key})
     print(
@@ -118,7 +121,7 @@ def make_page(options: Page) -> None:
 
 
 def _media(folder: Path) -> dict[str, dict[str, Path]]:
-    """The file of every method and scene."""
+    """The files by method and scene."""
     methods = sorted(path for path in folder.glob("*") if path.is_dir())
     files = {m.name: {p.stem: p for p in sorted(m.iterdir()) if p.suffix.lower() in SUFFIXES} for m in methods}
     if len(files.keys() - {INPUT}) < 2:
@@ -133,14 +136,15 @@ def _media(folder: Path) -> dict[str, dict[str, Path]]:
 
 
 def aggregate(key: dict[str, Any], answers: dict[Path, dict[str, Any]]) -> dict[str, Any]:
-    """Shares of choices (percent) and mean ratings by method and criterion, each with its interval.
+    """Shares of choices (percent) and mean ratings by method and criterion, each with its confidence interval.
 
     Args:
         key: as `make_page` writes it.
-        answers: of each person, by file. What a person left out does not count.
+        answers: of each participant, by file. Unanswered questions do not count.
 
     Raises:
-        UserError: there are none, or one is of another page, by the same person, or holds what the page does not offer.
+        UserError: there are no answers, or a file is for another page, by a participant with several files, or holds
+            answers that the page does not offer.
     """
     methods, people = key["methods"], [_counts(key, path, content) for path, content in answers.items()]
     names = [content["participant"] for content in answers.values()]
@@ -161,7 +165,7 @@ def aggregate(key: dict[str, Any], answers: dict[Path, dict[str, Any]]) -> dict[
 
 
 def _counts(key: dict[str, Any], path: Path, content: dict[str, Any]) -> tuple[np.ndarray, ...]:
-    """What one person answered: choices [M 5] and how many [5], sums of ratings [M 5] and how many [M 5]."""
+    """One participant's choices [M 5] and their number [5], and sums of ratings [M 5] and their number [M 5]."""
     if content.get("study") != key["study"]:
         raise UserError(f"{path}: answers to {content.get('study')!r}; expected answers to {key['study']!r}")
     methods = key["methods"]
@@ -186,8 +190,8 @@ def _counts(key: dict[str, Any], path: Path, content: dict[str, Any]) -> tuple[n
 
 
 def _with_interval(methods: Sequence[str], sums: np.ndarray, counts: np.ndarray, drawn: np.ndarray) -> dict[str, Any]:
-    """Ratios of the sums [P M 5] to the counts over all persons, and over each of the draws [R P] of persons."""
-    with np.errstate(invalid="ignore"):  # what nobody answered is NaN
+    """Sums [P M 5] over counts for all participants, with the interval over bootstrap resamples `drawn` [R P]."""
+    with np.errstate(invalid="ignore"):  # NaN where nobody answered
         mean = sums.sum(0) / counts.sum(0)
         again = np.einsum("rp,pmc->rmc", drawn, sums) / np.einsum("rp,pmc->rmc", drawn, counts)
     tail = 100 * (1 - COVERAGE) / 2

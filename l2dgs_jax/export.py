@@ -23,7 +23,7 @@ from l2dgs_jax.runs.views import get_split
 from l2dgs_jax.runtime import command_line
 from l2dgs_jax.runtime.files import make_folder, new_folder, replacing, write_json
 
-FILES = {  # what is written if --output says nothing else
+DEFAULT_FILES = {  # in RUN/exports, if --output is not given
     "ply": "scene.ply",
     "splat": "scene.splat",
     "gltf": "scene.glb",
@@ -32,29 +32,31 @@ FILES = {  # what is written if --output says nothing else
     "npz": "scene.npz",
     "cameras": "camera_path.json",
 }
-TIMELESS = {"time": ("html", "npz", "cameras"), "times": ("npz", "cameras")}  # what does not take the option
-MOST_INSTANTS = 48  # of a page, unless more are asked for
-IN_BYTES = ("splat", "cloud")  # which is how they hold colours: nothing is brighter than white
+FORMATS_WITHOUT = {"time": ("html", "npz", "cameras"), "times": ("npz", "cameras")}  # formats that reject an option
+MAX_KEY_INSTANTS = 48  # of a page, unless --times asks for more
+BYTE_COLOR_FORMATS = ("splat", "cloud")  # they store colours as bytes, so nothing can be brighter than white
 
 
 @dataclass(frozen=True)
 class Export:
-    """Write a run's well-lit scene at an instant, or at many, for viewers of Gaussian splats; or all of it, as arrays.
+    """Export a run: its well-lit scene at one or many instants for splat viewers, a web page, or the whole model.
 
-    Colours are baked: each Gaussian gets the one that shows the well-lit images best. How close they come is printed.
+    Colours are baked: each Gaussian gets the one colour with which the well-lit images are matched best. The PSNR that
+    this reaches is printed.
 
     Attributes:
         run: folder of the run.
-        to: Gaussians as a "ply" of 3D Gaussian Splatting, a "splat" of antimatter15's viewer or a "gltf" with
-            KHR_gaussian_splatting; a point "cloud" (.ply); the moving scene as one page for browsers ("html"); the
-            whole model as arrays ("npz"); or the "cameras" of a split as a path for nerfstudio.
-        output: file to write, or folder with --times; in RUN/exports if not given.
+        to: format to write: Gaussians as a "ply" of 3D Gaussian Splatting, a "splat" of antimatter15's viewer or a
+            "gltf" with KHR_gaussian_splatting; their centres as a point "cloud" (.ply); the moving scene as a web page
+            ("html"); the whole model as arrays ("npz"); or the "cameras" of a split as a nerfstudio camera path.
+        output: file to write, or with --times the folder; in RUN/exports if not given.
         time: instant to write, from 0 (first frame) to 1 (last frame); 0.5 if not given.
-        times: how many instants to write instead, spread evenly from 0 to 1: frame0001, frame0002 ... in a new folder;
-            or between how many of them a page interpolates: as many as frames, but at most 48, if not given.
-        split: whose cameras.
-        fps: frames a second of the path of cameras, and of the clip that a page plays.
-        stage: the last checkpoint, or the one at the end of the coarse stage.
+        times: number of instants to write, evenly spaced from 0 to 1, as frame0001, frame0002 ... in a new folder. For
+            "html", the number of key instants between which the page interpolates; if not given, one per frame, but at
+            most 48.
+        split: views whose cameras are exported, for --to cameras.
+        fps: frames per second of the camera path, or of the clip that the page plays.
+        stage: the last checkpoint ("final"), or the one at the end of the coarse stage ("coarse").
     """
 
     run: tyro.conf.Positional[Path]
@@ -68,7 +70,7 @@ class Export:
 
     @property
     def sequence(self) -> bool:
-        """Whether there will be a folder of files."""
+        """Whether a folder with one file per instant is written."""
         return self.times is not None and self.to != "html"
 
 
@@ -77,7 +79,7 @@ def main(arguments: Sequence[str]) -> None:
     options = command_line.parse(Export, arguments, "export")
     _check(options)
     run = open_run(options.run, options.stage)
-    path = options.output or options.run / "exports" / (options.to if options.sequence else FILES[options.to])
+    path = options.output or options.run / "exports" / (options.to if options.sequence else DEFAULT_FILES[options.to])
     make_folder(path.parent)
     if options.to == "cameras":
         split = get_split(run, options.split)
@@ -95,11 +97,11 @@ def main(arguments: Sequence[str]) -> None:
 
 
 def _check(options: Export) -> None:
-    """Complain of options that are out of range or do not go together, before anything is read."""
+    """Reject options that are out of range or cannot be combined, before anything is read."""
     instants = {name: value for name, value in (("time", options.time), ("times", options.times)) if value is not None}
     for name, value in instants.items():
-        if options.to in TIMELESS[name]:
-            others = ", ".join(to for to in FILES if to not in TIMELESS[name])
+        if options.to in FORMATS_WITHOUT[name]:
+            others = ", ".join(to for to in DEFAULT_FILES if to not in FORMATS_WITHOUT[name])
             raise UserError(f"--{name} {value}: {options.to} covers all instants; expected it with one of {others}")
     if len(instants) == 2:
         raise UserError(f"--times {options.times}: given beside --time {options.time}; expected one of the two")
@@ -110,7 +112,7 @@ def _check(options: Export) -> None:
             raise UserError(f"--{name} {count}: expected a whole number from 1")
     if options.to == "html" and options.times == 1:
         raise UserError("--times 1: html interpolates between instants; expected at least 2")
-    suffix = Path(FILES[options.to]).suffix
+    suffix = Path(DEFAULT_FILES[options.to]).suffix
     if options.output and not options.sequence and options.output.suffix != suffix:
         raise UserError(f"--output {options.output}: expected a file name that ends in {suffix}")
 
@@ -125,7 +127,7 @@ def _write_splats(run: Run, options: Export, path: Path) -> None:
     }
     middle = 0.5 if options.time is None else options.time
     times = np.linspace(0, 1, options.times).tolist() if options.times else [middle]
-    brightest = 1.0 if options.to in IN_BYTES else OVERBRIGHT
+    brightest = 1.0 if options.to in BYTE_COLOR_FORMATS else OVERBRIGHT
     counts, scores = [], []
     with new_folder(path) if options.sequence else replacing(path) as target:
         baked = bake(run, times, brightest)
@@ -134,7 +136,7 @@ def _write_splats(run: Run, options: Export, path: Path) -> None:
             shown = visible(splats)
             if not len(shown.means):
                 raise UserError(f"{run.name}: nothing is visible at time {times[number - 1]}; expected a trained scene")
-            file = target / f"frame{number:04d}{Path(FILES[options.to]).suffix}" if options.sequence else target
+            file = target / f"frame{number:04d}{Path(DEFAULT_FILES[options.to]).suffix}" if options.sequence else target
             file.write_bytes(encoders[options.to](shown))
             counts.append(len(shown.means))
             scores.append(closeness(run, splats, times[number - 1]))
@@ -149,7 +151,7 @@ def _write_page(run: Run, options: Export, path: Path) -> None:
     """Bake key instants into one page."""
     split = run.dataset.train
     frames = len(np.union1d(split.cameras.time, run.dataset.test.cameras.time))
-    count = options.times or min(max(frames, 2), MOST_INSTANTS)
+    count = options.times or min(max(frames, 2), MAX_KEY_INSTANTS)
     with replacing(path) as temporary:
         baked = bake(run, np.linspace(0, 1, count).tolist(), OVERBRIGHT, web_page.IMAGES)
         instants = list(tqdm(baked, total=count, desc="export", unit="instant", dynamic_ncols=True))

@@ -1,4 +1,4 @@
-"""`python -m l2dgs_jax.masks SCENE`: masks of what moves, for scores of the dynamic and the static region."""
+"""`python -m l2dgs_jax.masks SCENE`: masks of what moves, for scoring the dynamic and the static region."""
 
 import os
 from collections.abc import Sequence
@@ -19,15 +19,15 @@ from l2dgs_jax.runtime import command_line
 class Masks:
     """Find what moves and write SCENE/mask/1x/NAME.png for every frame: 255 where something moves, 0 elsewhere.
 
-    Masks fit the pictures as they lie in the scene, at full size and with the distortion of their lens.
+    Masks match the scene's original pictures: full size, with lens distortion.
 
     Attributes:
         scene: folder of the scene.
-        downscale: whole factor by which the images that are looked at are smaller than full size.
-        format: layout of the scene's folder; "auto": found from its contents.
-        held_out: rule for the views not trained on, as train has it; frames that it does not use get no mask.
-        overwrite: replace the masks that the scene has, of every size.
-        preview: picture to write, showing frames with what moves tinted.
+        downscale: integer factor by which to shrink the pictures for the computation.
+        format: layout of the scene's folder; "auto" recognises it from its contents.
+        held_out: which views are held out, as for train; frames that are neither trained on nor held out get no mask.
+        overwrite: replace the masks that the scene already has, at every scale.
+        preview: picture to write that shows some frames with the moving regions tinted.
     """
 
     scene: tyro.conf.Positional[Path]

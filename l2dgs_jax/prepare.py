@@ -1,4 +1,4 @@
-"""`python -m l2dgs_jax.prepare VIDEO_OR_FOLDER OUT`: poses and points for a video of one's own, dark as it may be."""
+"""`python -m l2dgs_jax.prepare VIDEO_OR_FOLDER OUT`: find camera poses and points for a video, even a dark one."""
 
 import dataclasses
 import sys
@@ -16,13 +16,13 @@ from l2dgs_jax.runtime import command_line
 
 @dataclass(frozen=True)
 class Prepare:
-    """Make a scene that `train` reads out of a video, or of a folder of frames, of a moving camera.
+    """Make a scene for `train` from a video, or a folder of frames, that a moving camera has taken.
 
     Attributes:
-        source: the video, or the folder of frames whose names count them.
-        output: folder to make; the work on it is kept in OUT.partial, where the same command goes on after an
-            interruption.
-        capture: how.
+        source: video, or folder of frames with numbered names.
+        output: folder to create; intermediate results are kept in OUT.partial, from which the same command continues
+            after an interruption.
+        capture: how the video becomes a scene.
     """
 
     source: tyro.conf.Positional[Path]

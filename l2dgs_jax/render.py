@@ -1,4 +1,4 @@
-"""`python -m l2dgs_jax.render RUN`: a run's held-out views, or a path through its scene, as pictures or videos."""
+"""`python -m l2dgs_jax.render RUN`: a run's views, or a camera path through its scene, as pictures or videos."""
 
 import os
 import re
@@ -20,34 +20,35 @@ from l2dgs_jax.runtime.files import make_folder
 from l2dgs_jax.types import RenderOutput
 from l2dgs_jax.visualize import display, films
 
-FRAMES = 96
-LONGEST_SIDE = 16382  # pixels that codecs take
+DEFAULT_FRAMES = 96  # of a camera path
+MAX_SIDE = 16382  # pixels; video codecs take no more
 
 
 @dataclass(frozen=True)
 class Render:
     """Render a run to DIR/PATH/OUTPUT/NAME.png, or with --format video to DIR/PATH/OUTPUT.mp4 (.webm without PyAV).
 
-    Frames that are there already are not rendered again. Depth is 16-bit: a value v stands for v * unit, in the units
-    of the scene's cameras, with the unit in DIR/PATH/depth.json; 0 means that nothing is there.
+    Frames that exist already are not rendered again. Depth pictures have 16 bits: a value v means a depth of v * unit,
+    in the units of the scene's cameras, and 0 that nothing is drawn; DIR/PATH/depth.json holds the unit.
 
     Attributes:
         run: folder of the run.
-        path: which way the camera goes. dataset: the views of a split, whose name stands for PATH; interpolate: along
-            the trained views; spiral: around the most central one; orbit: around what the cameras look at; freeze-time:
-            along the trained views while time stands still; freeze-camera: nowhere while time runs; or a
-            camera_path.json of nerfstudio, whose name stands for PATH.
-        split: which views, for --path dataset.
-        frames: how many pictures of a path; 96 if not given.
-        times: first and last instant of a path, within 0 and 1; all of it if not given.
-        at: the instant at which freeze-time stops, or whose camera freeze-camera keeps; 0.5 if not given.
-        outputs: what to show.
-        side_by_side: show the outputs next to each other in one picture.
-        size: WIDTH or WIDTHxHEIGHT of a picture, pixels; one of another shape is cut, not stretched.
-        format: png, exr (floating point, well-lit and low-light images in linear light), or video.
-        fps: frames a second of a video; those of the camera_path.json, or 24, if not given.
-        output: folder to write to; RUN/renders if not given (RUN/renders_coarse for the coarse stage).
-        stage: the last checkpoint, or the one at the end of the coarse stage.
+        path: camera path. dataset: the views of a split, whose name is PATH; interpolate: along the training views;
+            spiral: around the most central training view; orbit: around what the cameras look at; freeze-time: along
+            the training views while time stands still; freeze-camera: a fixed camera while time runs; or a
+            camera_path.json of nerfstudio, whose name is PATH.
+        split: views to render, for --path dataset.
+        frames: number of pictures along a path; 96 if not given.
+        times: first and last instant of a path, in [0, 1]; 0 and 1 if not given.
+        at: instant that freeze-time shows, or whose camera freeze-camera uses; 0.5 if not given.
+        outputs: images to render.
+        side_by_side: put the outputs next to each other in one picture.
+        size: size of a picture in pixels, WIDTH or WIDTHxHEIGHT; another aspect ratio crops the view, it does not
+            stretch it.
+        format: png, exr (floating point; well-lit and low-light images in linear light), or video.
+        fps: frames per second of a video; if not given, those of the camera_path.json, or 24.
+        output: the folder DIR; RUN/renders if not given (RUN/renders_coarse for the coarse stage).
+        stage: the last checkpoint ("final"), or the one at the end of the coarse stage ("coarse").
     """
 
     run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
@@ -65,10 +66,10 @@ class Render:
     stage: Literal["final", "coarse"] = "final"
 
     def check(self) -> None:
-        """Complain of what can be told to be wrong before the run is read.
+        """Check the options as far as that is possible before the run is read.
 
         Raises:
-            UserError: an option has no meaning, by itself or beside the others.
+            UserError: an option is invalid, or cannot be combined with another one.
         """
         flies, freezes = self.path in FLIGHTS, self.path in ("freeze-time", "freeze-camera")
         if not flies and self.path != "dataset" and not os.path.isfile(self.path):
@@ -107,7 +108,7 @@ def _shots(run: Run, options: Render) -> Shots:
         wanted = shots.of_split(run, options.split)
     elif options.path in FLIGHTS:
         first, last = options.times or (0.0, 1.0)
-        times = np.linspace(first, last, options.frames or FRAMES)
+        times = np.linspace(first, last, options.frames or DEFAULT_FRAMES)
         wanted = shots.of_flight(run, options.path, times, 0.5 if options.at is None else options.at)
     else:
         wanted = shots.of_file(run, Path(options.path))
@@ -116,9 +117,9 @@ def _shots(run: Run, options: Render) -> Shots:
         sides = [int(side) for side in options.size.split("x")]
         width, height = sides if len(sides) == 2 else (sides[0], max(1, round(height * sides[0] / width)))
     longest = max(width * (len(options.outputs) if options.side_by_side else 1), height)
-    if min(width, height) < 1 or longest > LONGEST_SIDE:
+    if min(width, height) < 1 or longest > MAX_SIDE:
         source = f"--size {options.size}" if options.size else f"--path {options.path}"
-        raise UserError(f"{source}: {width}x{height} pixels; expected at least 1, and no picture over {LONGEST_SIDE}")
+        raise UserError(f"{source}: {width}x{height} pixels; expected at least 1, and no picture over {MAX_SIDE}")
     fps = wanted.fps if options.fps is None else options.fps
     if not 0.1 <= fps <= 1000:
         raise UserError(f"{fps:g} frames a second; expected --fps from 0.1 to 1000")

@@ -1,4 +1,4 @@
-"""`python -m l2dgs_jax.simulate SCENE OUT`: a low-light twin of a scene, with the scene itself as its truth."""
+"""`python -m l2dgs_jax.simulate SCENE OUT`: a low-light twin of a scene, with the scene itself as ground truth."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -21,17 +21,18 @@ CONTACT_SHEET = "contact_sheet.png"
 
 @dataclass(frozen=True)
 class Simulate:
-    """Darken a well-lit scene as L2DGS and LEDNet did, and write it in the layout of Nerfies: rgb dark, well as it was.
+    """Darken a well-lit scene as L2DGS and LEDNet did; writes dark frames to rgb/ and the original ones to well/.
 
-    Beside it, simulate.json says how and how dark every frame became, and contact_sheet.png shows some.
+    The twin has the layout of Nerfies. simulate.json records the settings and how dark every frame became;
+    contact_sheet.png shows some frames.
 
     Attributes:
-        scene: folder of the scene, in any known layout; its well-lit pictures if it has both kinds.
+        scene: folder of the scene, in any known layout; if it has dark and well-lit pictures, the latter are used.
         output: new folder for the twin.
-        downscale: whole factor by which images are smaller than full size.
-        format: layout of the scene's folder; "auto": found from its contents.
-        held_out: rule for the views not trained on, as train has it; frames that it does not use are left out.
-        darkening: how.
+        downscale: integer factor by which to shrink the pictures.
+        format: layout of the scene's folder; "auto" recognises it from its contents.
+        held_out: which views are held out, as for train; frames that are neither trained on nor held out are left out.
+        darkening: how the frames are darkened.
     """
 
     scene: tyro.conf.Positional[str]

@@ -1,4 +1,4 @@
-"""`python -m l2dgs_jax.sweep SPEC.toml OUT`: a study of scenes, seeds and settings, trained together."""
+"""`python -m l2dgs_jax.sweep SPEC.toml OUT`: train a study of many scenes, seeds and settings."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -19,14 +19,14 @@ from l2dgs_jax.study.spec import read
 
 @dataclass(frozen=True)
 class Sweep:
-    """Train all members of a study, those whose shapes agree by one program, and compare them in one table.
+    """Train all members of a study and compare them in a table; one program trains members whose array shapes agree.
 
     Attributes:
         spec: TOML file with scenes, seeds and settings; docs/studies.md shows one.
-        output: folder for the study: a run in a folder of its own for each member, results.json, .md and .png.
+        output: folder for the study: a run folder for each member, and results.json, .md and .png.
         resume: continue the study in the output folder from its last checkpoints.
-        devices: how many devices the members are spread over, each core of a processor being one; all if not given.
-        hosts: several processes.
+        devices: number of devices to spread the members over; every CPU core is one. If not given, all.
+        hosts: training on several hosts.
     """
 
     spec: tyro.conf.Positional[Path]

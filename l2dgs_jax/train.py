@@ -46,21 +46,21 @@ class Train:
     Attributes:
         scene: folder of the scene, or "demo" for the clip that comes with the package.
         preset: settings to start from, which the options below override one by one; the defaults shown here are the
-            preset's. Their steps: demo 400, fast 600, default 1200 (about ten minutes on one core for frames of
-            200x112, and more with pixels and points), best 5000, authors 17000, paper 23000; to compare with, 1200
-            each: 4dgs, enhance-4dgs, curve-4dgs, static.
-        output: run folder; a fresh one under runs/ if not given.
+            preset's. Number of steps: demo 400, fast 600, default 1200 (about ten minutes on one core for frames of
+            200x112, longer for more pixels or points), best 5000, authors 17000, paper 23000; 1200 each for the
+            baselines 4dgs, enhance-4dgs, curve-4dgs and static.
+        output: run folder; a new one under runs/ if not given.
         resume: continue the run in the output folder from its last checkpoint.
-        devices: how many devices the views of a step are spread over; each core of a processor is one. If not given,
-            as many as share them evenly.
+        devices: number of devices to spread the views of a step over; every CPU core is one. If not given, as many as
+            get equal shares.
         quiet: show nothing but warnings and errors.
-        json: print one JSON object a line, docs/training.md says which.
-        report: leave out report.html, a page in the run folder that shows how it goes.
-        tensorboard: write events for TensorBoard to the run folder; wants the extra of that name.
-        view: show the scene in the browser while it trains; wants the extra of that name.
-        view_host: address to show it at; 0.0.0.0 lets every machine of the network in.
-        view_port: port to show it at, or the next that is free.
-        hosts: several processes.
+        json: print progress as JSON, one object per line (see docs/training.md).
+        report: do not write report.html, the page in the run folder that shows the progress of the training.
+        tensorboard: write events for TensorBoard to the run folder; needs the extra "tensorboard".
+        view: show the scene in the browser while it trains; needs the extra "view".
+        view_host: address that the viewer listens at; 0.0.0.0 admits every machine on the network.
+        view_port: port that the viewer listens at, or the next free one.
+        hosts: training on several hosts.
     """
 
     scene: tyro.conf.Positional[str]
@@ -103,7 +103,7 @@ def _train(options: Train) -> None:
             dataset = load_dataset(options.scene, config.downscale, config.format, config.held_out, config.frame_memory)
             dataset = enhanced(dataset, config.enhance, int(config.seed))
             config = resolve(config, dataset)
-            # What cannot start should leave no folder.
+            # A training that cannot start should leave no folder behind.
             start = standing(folder, dataset, config) if options.resume else Checkpoint(initial_state(dataset, config))
         distributed.barrier("everything is read")
         if first:
@@ -111,7 +111,7 @@ def _train(options: Train) -> None:
                 with new_folder(folder) as place:
                     runs.write_settings(place, options.scene, config)
                 stack.enter_context(locked(folder))
-            with _display(options) as display, _end_told(display):
+            with _display(options) as display, _end_reported(display):
                 _record(dataset, options, config, start, display)
         else:
             runs.fit(dataset, config, start=start, device_count=options.devices)
@@ -120,7 +120,7 @@ def _train(options: Train) -> None:
 
 @contextlib.contextmanager
 def _display(options: Train) -> Iterator[Display]:
-    """All that shows how it goes."""
+    """Everything that shows the progress of the training."""
     folder = options.output
     assert folder is not None
     with displays.choose(options.quiet, options.json) as display:
@@ -133,7 +133,7 @@ def _display(options: Train) -> Iterator[Display]:
 
 
 def _record(dataset: Dataset, options: Train, config: Config, start: Checkpoint, display: Display) -> None:
-    """Train, leave the steps in the run folder, and show what came of them."""
+    """Train, record the steps in the run folder, and then write the contact sheet and the video."""
     folder = options.output
     assert folder is not None
     display("start", scene=dataset.name, run=str(folder), step=int(start.state.step), steps=config.steps)
@@ -153,7 +153,7 @@ def _record(dataset: Dataset, options: Train, config: Config, start: Checkpoint,
 
 
 def _fit(dataset: Dataset, options: Train, config: Config, start: Checkpoint, display: Display) -> Run:
-    """Train, and say how to go on if that is stopped."""
+    """Train, and say how to continue if the training is stopped."""
     folder = options.output
     assert folder is not None
     notice = "stopping after this step; Ctrl-C now stops at once, and loses the steps since the last checkpoint"
@@ -179,7 +179,7 @@ def _fit(dataset: Dataset, options: Train, config: Config, start: Checkpoint, di
 def _watching(
     dataset: Dataset, options: Train, config: Config, display: Display
 ) -> Iterator[Callable[[Progress], None] | None]:
-    """The viewer, if it is asked for."""
+    """Serve the viewer if --view is given; yields what to call after every step, or None."""
     if not options.view:
         yield None
         return
@@ -190,8 +190,8 @@ def _watching(
 
 
 @contextlib.contextmanager
-def _end_told(display: Display) -> Iterator[None]:
-    """Tell programs how it ended; people read the error itself."""
+def _end_reported(display: Display) -> Iterator[None]:
+    """Report how the training ended as an event, for programs; people read the error itself."""
     try:
         yield
     except (UserError, Interrupted) as end:
@@ -202,7 +202,7 @@ def _end_told(display: Display) -> Iterator[None]:
 
 def _parse(arguments: Sequence[str]) -> Train:
     """Parse twice: preset, scene and run folder decide what the other options override."""
-    if command_line.HELP & set(arguments):
+    if command_line.HELP_OPTIONS & set(arguments):
         _show_help(arguments)
     first = command_line.parse(Train, arguments, "train")
     if first.scene != "demo":
@@ -222,16 +222,16 @@ def _parse(arguments: Sequence[str]) -> Train:
 
 
 def _show_help(arguments: Sequence[str]) -> None:
-    """Show the preset's settings as defaults, and exit."""
-    asked = [argument for argument in arguments if argument not in command_line.HELP]
+    """Show the help with the preset's settings as defaults, and exit."""
+    asked = [argument for argument in arguments if argument not in command_line.HELP_OPTIONS]
     preset = _preset(command_line.parse(Train, asked, "train", Train(scene="")))
-    # A scene is still wanted: an instance could not be without one.
+    # Not an instance, which would need a scene: the help should show the scene as required.
     shown = functools.partial(Train, preset=preset, hosts=Hosts(), config=PRESETS[preset])
     command_line.parse(shown, ["--help"], "train")
 
 
 def _preset(options: Train) -> str:
-    """The preset that is asked for, or else the scene's."""
+    """The preset that is asked for, or else the scene's default one."""
     preset = options.preset or ("demo" if options.scene == "demo" else "default")
     if preset not in PRESETS:
         raise UserError(f"--preset {preset}: no such preset; expected one of {', '.join(PRESETS)}")
@@ -239,7 +239,7 @@ def _preset(options: Train) -> str:
 
 
 def _run_folder(scene: str, resume: bool) -> Path:
-    """runs/NAME, runs/NAME-2 ...: the first that is free, or with `resume` the last that is not."""
+    """runs/NAME, runs/NAME-2 ...: the first that does not exist, or with `resume` the last that does."""
     name, taken = Path(scene).name, 0
 
     def candidate(index: int) -> Path:
@@ -253,7 +253,7 @@ def _run_folder(scene: str, resume: bool) -> Path:
 
 
 def _check_devices(options: Train) -> None:
-    """Complain early if the views of a step cannot be spread over as many devices as wanted."""
+    """Fail early if the views of a step cannot be spread over the number of devices asked for."""
     views = options.config.batch_size
     count = devices.shares(views) if options.devices is None else options.devices
     if count < 1 or views % count:

@@ -1,4 +1,4 @@
-"""The containers that flow through the package: NamedTuples of arrays, nothing static in them."""
+"""The containers that are passed between the package's functions: NamedTuples of arrays, without static fields."""
 
 from typing import NamedTuple
 
@@ -11,7 +11,7 @@ class Camera(NamedTuple):
     Axes are OpenCV's (x right, y down, z forward) and pixel centres lie at +0.5.
 
     Attributes:
-        viewmat: world to camera, rigid.
+        viewmat: rigid world-to-camera matrix.
         K: intrinsics in pixels.
         time: instant in [0, 1], 0 being the first frame and 1 the last.
     """
@@ -33,11 +33,11 @@ class Gaussians(NamedTuple):
         illumination_rest: SH coefficients b_2 ... b_J of Eq. 2.
         reflectance: r of Eq. 6.
         attenuation: brightness attenuation features (b1, b2) of Eq. 8.
-        gate: how much of the motion field acts, before the sigmoid; None: all of it.
+        gate: logit of a factor in (0, 1) on all that the motion field does to a Gaussian; None: no gates, factor 1.
         paths: displacements, as K control points of a cubic spline over [0, 1], world units; None: no Gaussian has one.
-        lifetimes: the first and the last instant at which a Gaussian with a path is there; infinite for those without.
-        color_rest: SH coefficients 2 ... J of a colour that `reflectance` is the constant part of, in scenes that are
-            not decomposed; None in those that are.
+        lifetimes: first and last instant at which a Gaussian with a path is visible; infinite for those without a path.
+        color_rest: SH coefficients 2 ... J of the colour, of which `reflectance` is the constant part, in scenes
+            without a decomposition; None in the others.
     """
 
     means: Float[Array, "*B N 3"]
@@ -63,7 +63,7 @@ class MovedGaussians(NamedTuple):
         scales: standard deviations in world units.
         opacities: in [0, 1]; exactly 0 for rows that are not alive.
         illumination: l of Eq. 3, seen from the camera of that instant.
-        reflectance: r of Eq. 6, or in scenes that are not decomposed the colour seen from the camera of that instant.
+        reflectance: r of Eq. 6, or in scenes without a decomposition the colour seen from the camera of that instant.
         attenuation: (b1, b2) of Eq. 8.
     """
 
@@ -120,7 +120,7 @@ class MotionHeads(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """What the heads add to raw parameters at an instant; `logit_opacities` is None without that head."""
+    """What the heads add to raw parameters at an instant; `logit_opacities` is None without the opacity head."""
 
     means: Float[Array, "*B 3"]
     quats: Float[Array, "*B 4"]
@@ -148,11 +148,11 @@ class BAFENet(NamedTuple):
 
 
 class ToneCurves(NamedTuple):
-    """Curves from well-lit to dark values (`model/tone_curves.py`), as logarithms of what each of R ramps rises by.
+    """Tone curves from well-lit to dark values (`model/tone_curves.py`): logarithms of the rises of R ramps.
 
     Attributes:
-        shared: of all views.
-        offsets: what is added to it for each training frame.
+        shared: the curve that all views share.
+        offsets: added to `shared` for each training frame.
     """
 
     shared: Float[Array, "*B R"]
@@ -162,12 +162,13 @@ class ToneCurves(NamedTuple):
 class SceneParams(NamedTuple):
     """Everything that is learned.
 
-    Two of these say nothing of the scene but of the frames that it was learned from.
+    The last two fields describe the training frames, not the scene.
 
     Attributes:
-        exposures: logarithms of the gains of the training frames' channels, which take no part in rendering; None if
-            the camera's exposure did not change.
-        curves: how the frames became dark, in scenes whose low light is a curve of the well-lit image; None in others.
+        exposures: logarithms of the gains of every training frame's colour channels, not used for rendering; None if
+            the camera's exposure is taken to be constant.
+        curves: how the frames became dark, in scenes whose low-light image is a tone curve of the well-lit one; None
+            in the others.
     """
 
     gaussians: Gaussians
@@ -186,7 +187,7 @@ class Scene(NamedTuple):
         params: learned values.
         alive: which Gaussians exist.
         bounds: lowest and highest corner of the HexPlane's box, world units, not learned.
-        extent: the length that position steps scale with, world units (`ModelConfig.unit`).
+        extent: the length that learning rates of positions scale with, world units (`ModelConfig.unit`).
     """
 
     params: SceneParams
@@ -203,7 +204,7 @@ class RasterOutput(NamedTuple):
         alpha: accumulated opacity, 1 - final transmittance.
         depth: as `depth_mode` says, world units; 0 where nothing is drawn.
         means2d: projected centres in pixels.
-        radii: half-widths in pixels of the box that a Gaussian's visible ellipse fills; 0 where it is not drawn.
+        radii: larger half-width of the bounding box of a Gaussian's visible ellipse, pixels; 0 where it is not drawn.
         pairs: how many (Gaussian, tile) pairs the scene needs.
         overflow: whether `pairs` exceeds the pair buffer; the images are then invalid.
     """

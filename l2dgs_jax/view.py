@@ -22,9 +22,9 @@ class View:
 
     Attributes:
         run: folder of the run.
-        host: address to listen at; 0.0.0.0 lets every machine of the network in.
-        port: to listen at, or the next that is free.
-        stage: the last checkpoint, or the one at the end of the coarse stage.
+        host: address to listen at; 0.0.0.0 admits every machine on the network.
+        port: port to listen at, or the next free one.
+        stage: the last checkpoint ("final"), or the one at the end of the coarse stage ("coarse").
     """
 
     run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]

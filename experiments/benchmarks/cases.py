@@ -1,4 +1,4 @@
-"""What is measured. A case is a function that returns its figures by name; names end in their unit."""
+"""The benchmark cases. A case is a function that returns its figures by name; names end in their unit."""
 
 import dataclasses
 import itertools
@@ -38,7 +38,7 @@ from l2dgs_jax.types import Camera, MovedGaussians, RenderOutput, Scene
 Figures = dict[str, float]
 
 DEFAULT = PRESETS["default"]
-# What `training.resolve` would take from the frames; it costs the same whatever they are.
+# Fixed values for the settings that `training.resolve` would derive from the frames; they do not affect the cost.
 CONFIG = overrides.replace(
     DEFAULT,
     {
@@ -51,28 +51,37 @@ CONFIG = overrides.replace(
         "density.stop": 0,
     },
 )
-TENTH = overrides.replace(CONFIG, {"model.moving_share": 0.1})  # of them moves
+TENTH_MOVING = overrides.replace(CONFIG, {"model.moving_share": 0.1})
 VARIANTS = {
-    "tenth_moving": TENTH,
+    "tenth_moving": TENTH_MOVING,
     "without_paths": overrides.replace(CONFIG, {"model.tracks": False}),
     "without_gates": overrides.replace(CONFIG, {"model.motion_gate": False}),
 }
-SIZES = {"10k_160x96": (10_000, 160, 96), "50k_480x270": (50_000, 480, 270), "50k_800x450": (50_000, 800, 450)}
-STEPS = {"10k_200x112": (10_000, 200, 112), "40k_400x225": (40_000, 400, 225), "50k_800x450": (50_000, 800, 450)}
-SCALES = (  # Gaussians, frames, width, height
+# Gaussians, width, height.
+RASTERIZER_SIZES = {
+    "10k_160x96": (10_000, 160, 96),
+    "50k_480x270": (50_000, 480, 270),
+    "50k_800x450": (50_000, 800, 450),
+}
+STEP_SIZES = {
+    "10k_200x112": (10_000, 200, 112),
+    "40k_400x225": (40_000, 400, 225),
+    "50k_800x450": (50_000, 800, 450),
+}
+LARGE_SCENES = (  # Gaussians, frames, width, height
     (40_000, 60, 400, 225),
     (200_000, 60, 400, 225),
     (200_000, 1_000, 400, 225),
     (200_000, 1_000, 800, 450),
     (500_000, 300, 400, 225),
 )
-PLACES = ("memory", "file")  # of the frames
+FRAME_PLACES = ("memory", "file")
 
 
 def rasterizer() -> Figures:
-    """Forward, and forward plus backward in every input, next to a C blend of the same lists."""
+    """Forward pass, and forward plus backward pass for all inputs, compared with a C blend of the same lists."""
     figures = {}
-    for name, size in SIZES.items():
+    for name, size in RASTERIZER_SIZES.items():
         forward, both, pairs = _rasterizer(*size)
         native = NativeBlend(cloud(*size), *size[1:])
         limit = best_of(native.forward), best_of(native.backward)
@@ -88,7 +97,7 @@ def rasterizer() -> Figures:
 
 
 def growth() -> Figures:
-    """Rasterizer, forward plus backward, per million pairs as the work grows."""
+    """Rasterizer, forward plus backward pass: time per million (Gaussian, tile) pairs as the work grows."""
     figures = {}
     for count in (5_000, 20_000, 50_000, 200_000):
         for width, height in ((200, 112), (400, 225), (800, 450)):
@@ -100,7 +109,7 @@ def growth() -> Figures:
 
 
 def folding() -> Figures:
-    """Four scenes drawn with their gradients in one vmapped call, next to one by one; the first holds most pairs."""
+    """Four scenes drawn with gradients in one vmapped call, compared with one by one; the first has most pairs."""
     width, height, counts = 160, 96, (10_000, 1_000, 1_000, 1_000)
     scenes = [{name: jnp.asarray(x) for name, x in cloud(max(counts), width, height, seed=i).items()} for i in range(4)]
     for scene, count in zip(scenes, counts, strict=True):
@@ -161,19 +170,19 @@ def parts() -> Figures:
 
 
 def step() -> Figures:
-    """The whole fine step as `train` takes it: loss, gradient and Adam, two views, on two devices where there are."""
-    figures = {f"{name}_ms": _step(*size, CONFIG) for name, size in STEPS.items()}
-    size = STEPS["40k_400x225"]
+    """A whole step of the fine stage as in `train`: loss, gradient and Adam; two views, on two devices if possible."""
+    figures = {f"{name}_ms": _step(*size, CONFIG) for name, size in STEP_SIZES.items()}
+    size = STEP_SIZES["40k_400x225"]
     return figures | {f"40k_400x225_{name}_ms": _step(*size, config) for name, config in VARIANTS.items()}
 
 
 def rendering() -> Figures:
-    """Frames of a moving scene, 40 k Gaussians at 400x225, the camera and the instant new in each."""
-    return _rendering(CONFIG) | {f"tenth_moving_{name}": rate for name, rate in _rendering(TENTH).items()}
+    """Frames of a moving scene, 40 k Gaussians at 400x225, each at another instant."""
+    return _rendering(CONFIG) | {f"tenth_moving_{name}": rate for name, rate in _rendering(TENTH_MOVING).items()}
 
 
 def seeding() -> Figures:
-    """What precedes the first step, of the demo clip: flow between frames, seeds on what moves, points on the rest."""
+    """Work before the first step, on the demo clip: flow between frames, seeds on moving objects, static points."""
     dataset = load_dataset("demo")
     most = dataset.width * dataset.height
     return {
@@ -184,7 +193,7 @@ def seeding() -> Figures:
 
 
 def compiling() -> Figures:
-    """Time to the end of a stage's first step in a new process, cache empty and then filled."""
+    """Time of a stage's first step in a new process, with the compilation cache empty and then filled."""
     figures = {}
     for stage in ("coarse", "fine"):
         with tempfile.TemporaryDirectory() as folder:
@@ -194,15 +203,15 @@ def compiling() -> Figures:
 
 
 def memory() -> Figures:
-    """Peak of a process that takes steps of 50 k Gaussians at 800x450, and what 1,000 small steps add."""
+    """Peak memory of a process that takes steps with 50 k Gaussians at 800x450, and growth over 1,000 small steps."""
     peak, growth = (float(_child(name)) for name in ("large_steps", "thousand_steps"))
     return {"50k_800x450_peak_gib": peak, "thousand_steps_growth_gib": growth}
 
 
 def scale() -> Figures:
-    """Fine steps and the peak of their process, start included, with the frames in memory and in a file."""
+    """Time of fine steps and peak memory of their process, with the frames in memory and in a file."""
     figures = {}
-    for size, place in itertools.product(SCALES, PLACES):
+    for size, place in itertools.product(LARGE_SCENES, FRAME_PLACES):
         milliseconds, peak = _child("training", *map(str, size), place).split()
         name = scale_name(*size, place)
         figures |= {f"{name}_ms": float(milliseconds), f"{name}_peak_gib": float(peak)}
@@ -210,7 +219,7 @@ def scale() -> Figures:
 
 
 def scale_name(count: int, frames: int, width: int, height: int, place: str) -> str:
-    """How figures of one of `SCALES` begin."""
+    """How the names of the figures of one of `LARGE_SCENES` begin."""
     return f"{count // 1000}k_{frames}_frames_{width}x{height}_{place}"
 
 
@@ -267,14 +276,14 @@ def _rendering(config: Config) -> Figures:
 
 
 def _step(count: int, width: int, height: int, config: Config) -> float:
-    """Milliseconds of one step; begun anew now and then, because what learns noise needs ever more pairs."""
+    """Milliseconds of one step; restarted several times, because a scene that learns noise needs ever more pairs."""
     return min(best_of(_stepper(count, width, height, config=config), 5) for _ in range(4))
 
 
 def _stepper(
     count: int, width: int, height: int, margin: float = 1.3, moving: bool = True, config: Config = CONFIG
 ) -> Callable[[], Any]:
-    """Takes the next training step at every call; the pair buffer holds `margin` times what the first one needs."""
+    """A function that takes the next training step; the pair buffer holds `margin` times what the first step needs."""
     state, batch = training(count, width, height, config)
     views = len(batch.images)
     moved = _move(state.scene, batch.cameras)
@@ -302,7 +311,7 @@ def _stepper(
 
 
 def _child(name: str, *arguments: str) -> str:
-    """What a function of this module prints in a process of its own."""
+    """The last line that a function of this module prints in a process of its own."""
     program = (
         "import sys; from l2dgs_jax.runtime.devices import one_per_core; one_per_core(); "
         f"from experiments.benchmarks import cases; cases._{name}(*sys.argv[1:])"

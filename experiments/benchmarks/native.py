@@ -1,4 +1,4 @@
-"""The machine's limit for blending: the same lists through a C loop, compiled for this processor, on all cores."""
+"""The machine's limit for blending: a C loop over the same lists, compiled for this processor, on all cores."""
 
 import ctypes
 import subprocess
@@ -9,7 +9,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from l2dgs_jax.kernels.tiles import TILE, TileLists, grid
+from l2dgs_jax.kernels.tiles import TILE_SIZE, TileLists, grid
 from l2dgs_jax.rasterizer.projection import project
 from l2dgs_jax.rasterizer.tile_lists import footprints, intersect, pairs_needed
 
@@ -17,7 +17,7 @@ FLAGS = ("-Ofast", "-march=native", "-mprefer-vector-width=512", "-fopenmp", "-s
 
 
 class NativeBlend:
-    """Forward and backward of one scene as callables without arguments, for a stopwatch.
+    """Forward and backward pass of one scene as methods without arguments, for timing.
 
     Raises:
         RuntimeError: gcc is missing or cannot compile the loop.
@@ -31,14 +31,14 @@ class NativeBlend:
         self.pairs = int(lists.stops[-1])
         geometry = np.concatenate([means2d, conics, arrays["opacities"][:, None]], axis=-1)
         float32 = partial(np.ascontiguousarray, dtype=np.float32)
-        image = lambda: np.zeros((tiles, channels, TILE * TILE), np.float32)
+        image = lambda: np.zeros((tiles, channels, TILE_SIZE * TILE_SIZE), np.float32)
         self._inputs = (
             float32(geometry),
             float32(arrays["features"]),
             np.ascontiguousarray(lists.gaussians, np.int32),
             np.append(lists.starts, self.pairs).astype(np.int32),
         )
-        self._output, self._transmittance = image(), np.zeros((tiles, TILE * TILE), np.float32)
+        self._output, self._transmittance = image(), np.zeros((tiles, TILE_SIZE * TILE_SIZE), np.float32)
         self._cotangent = float32(np.random.default_rng(0).normal(size=self._output.shape))
         self._gradient = np.zeros((self.pairs, 6 + channels), np.float32)
         self._shape = (tiles, columns)
@@ -48,7 +48,7 @@ class NativeBlend:
         self._library.fwd(*_pointers(self._inputs), *self._shape, *_pointers((self._output, self._transmittance)))
 
     def backward(self) -> None:
-        """The gradient of every (Gaussian, tile) pair, for a fixed random cotangent; `forward` comes first."""
+        """Gradients of every (Gaussian, tile) pair, for a fixed random cotangent; `forward` must be called first."""
         outputs = (self._output, self._transmittance, self._cotangent, self._gradient)
         self._library.bwd(*_pointers(self._inputs), *self._shape, *_pointers(outputs))
 

@@ -1,4 +1,4 @@
-"""Measure, and compare with this machine's baseline: `python -m experiments.benchmarks.run [CASE ...] [--check]`."""
+"""Run benchmarks, compare with this machine's baseline: `python -m experiments.benchmarks.run [CASE ...] [--check]`."""
 
 import json
 import re
@@ -15,7 +15,7 @@ from l2dgs_jax.runtime import devices
 from l2dgs_jax.runtime.command_line import use_huge_pages
 
 BASELINES = Path(__file__).with_name("baselines")
-TOLERANCE = 1.3  # machines are shared: a smaller ratio is noise
+TOLERANCE = 1.3  # ratio to the baseline; smaller ones are noise, because machines are shared
 
 
 @dataclass
@@ -24,9 +24,9 @@ class Options:
 
     Attributes:
         cases: which to run.
-        json: where to write the figures.
+        json: file to write the figures to.
         check: exit with code 1 if a figure is worse than the baseline of this machine by more than the tolerance.
-        update: make them the baseline of this machine.
+        update: make the figures the baseline of this machine.
     """
 
     cases: Annotated[tuple[str, ...], tyro.conf.Positional] = tuple(CASES)
@@ -73,13 +73,13 @@ def main() -> None:
 
 
 def slug(machine: dict[str, str | int]) -> str:
-    """What the machine's baseline is called."""
+    """Name of the machine's baseline."""
     name = f"{machine['processor']} {machine['cores']} cores"
     return re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")
 
 
 def slowdown(name: str, value: float, baseline: float | None) -> float | None:
-    """How many times as much time or memory as the baseline; None where there is none to compare with."""
+    """Time or memory as a multiple of the baseline's; None if there is none to compare with."""
     if not baseline or not value:
         return None
     return baseline / value if name.endswith("_per_s") else value / baseline

@@ -1,4 +1,4 @@
-"""Scenes of any size to measure on: random clouds that fill the view, as the golden tests use, and whole models."""
+"""Scenes of any size to measure on: random clouds that fill the view, as in the golden tests, and whole models."""
 
 from functools import partial
 
@@ -18,9 +18,9 @@ from l2dgs_jax.types import Camera
 
 
 def cloud(count: int, width: int, height: int, *, channels: int = 6, seed: int = 0) -> dict[str, np.ndarray]:
-    """Gaussians at depths 2 to 6 in a 60 degree view, a little wider than it.
+    """Gaussians at depths 2 to 6 that fill a 60 degree view and a little more.
 
-    World sizes depend on `count` only, so footprints in pixels grow with the resolution.
+    Their sizes in the world depend only on `count`, so their footprints in pixels grow with the resolution.
     """
     rng = np.random.default_rng(seed)
     focal = width / (2 * np.tan(np.deg2rad(30)))
@@ -47,7 +47,7 @@ def cloud(count: int, width: int, height: int, *, channels: int = 6, seed: int =
 
 
 def video(count: int, width: int, height: int, frames: int, *, in_file: bool = False) -> Dataset:
-    """Frames of noise, each another, around a `cloud`."""
+    """A data set of frames of different noise, with cameras around a `cloud`."""
     arrays = cloud(count, width, height)
     rng = np.random.default_rng(1)
     viewmats = np.tile(arrays["viewmat"], (frames, 1, 1))
@@ -66,7 +66,7 @@ def video(count: int, width: int, height: int, frames: int, *, in_file: bool = F
 
 
 def fine_state(dataset: Dataset, config: Config) -> TrainState:
-    """The start of the fine stage, with the `cloud` of a `video` as Gaussians and paths along which nothing moves."""
+    """The state at the start of the fine stage, with the `cloud` of a `video` as Gaussians and paths without motion."""
     count, frames = len(dataset.points), len(dataset.train.names)
     arrays = cloud(count, dataset.width, dataset.height)
     # Tracks and surfaces found in noise would add Gaussians.

@@ -1,4 +1,4 @@
-"""Timing, peak memory, and what machine it was."""
+"""Timing, peak memory, and a description of the machine."""
 
 import os
 import platform
@@ -12,7 +12,7 @@ import jaxlib
 
 
 def best_of(call: Callable[[], Any], repeats: int = 9) -> float:
-    """Milliseconds of the fastest of some calls, after one that compiles: what the machine can do undisturbed."""
+    """Milliseconds of the fastest of several calls, after one that compiles: the least disturbed measurement."""
     jax.block_until_ready(call())
     times = []
     for _ in range(repeats):
@@ -34,7 +34,7 @@ def resident_memory() -> float:
 
 
 def machine() -> dict[str, str | int]:
-    """Processor, cores and versions, to be kept beside every figure."""
+    """Processor, cores and versions, to be stored with the figures."""
     return {
         "processor": _processor(),
         "cores": len(os.sched_getaffinity(0)),

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import tyro
 
-from experiments.benchmarks.cases import PLACES, SCALES, scale_name
+from experiments.benchmarks.cases import FRAME_PLACES, LARGE_SCENES, scale_name
 
 Figures = dict[str, dict[str, float]]  # by case and name
 TABLES = {
@@ -53,7 +53,7 @@ UNITS = {"_per_s": " a second", "_ms_per_million_pairs": " ms", "_ms": " ms", "_
 
 
 def markdown(title: str, figures: Figures) -> str:
-    """One of `TABLES`."""
+    """One of `TABLES`, as Markdown."""
     rows = ["| | |", "|---|---|"]
     for label, where in TABLES[title].items():
         case, name = where.split()
@@ -62,9 +62,9 @@ def markdown(title: str, figures: Figures) -> str:
 
 
 def larger_scenes(figures: Figures) -> str:
-    """A row for each of `SCALES` and each place of its frames."""
+    """A table with a row for each of `LARGE_SCENES` and each place of its frames."""
     rows = ["| Gaussians | frames | size | frames lie in | step | peak |", "|---|---|---|---|---|---|"]
-    for size, place in itertools.product(SCALES, PLACES):
+    for size, place in itertools.product(LARGE_SCENES, FRAME_PLACES):
         count, frames, width, height = size
         name = scale_name(*size, place)
         found = (shown(unit, figures["scale"][f"{name}{unit}"]) for unit in ("_ms", "_peak_gib"))
@@ -73,7 +73,7 @@ def larger_scenes(figures: Figures) -> str:
 
 
 def shown(name: str, value: float) -> str:
-    """Two digits are all that a shared machine is good for."""
+    """A figure with its unit, rounded to two digits: measurements on a shared machine are not more precise."""
     unit = next((unit for ending, unit in UNITS.items() if name.endswith(ending)), "")
     return f"{value:.0f}{unit}" if value >= 10 else f"{float(f'{value:.2g}'):g}{unit}"
 

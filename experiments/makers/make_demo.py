@@ -1,6 +1,7 @@
-"""Make the embedded demo clip from a Nerfies scene: `python -m experiments.makers.make_demo SOURCE [--frames N]`.
+"""Make the packaged demo clip from a Nerfies scene: `python -m experiments.makers.make_demo SOURCE [--frames N]`.
 
-The first N frames at half size, each pixel the mean of a 2x2 block, with cameras and points; every eighth is held out.
+It has the first N frames at half size, each pixel being the mean of a 2x2 block, with cameras and points; every eighth
+frame is held out.
 """
 
 import argparse

@@ -1,6 +1,6 @@
-"""The README's picture of a run: `python -m experiments.makers.make_figure RUN OUTPUT.png [--views N]`.
+"""Make the README's picture of a run: `python -m experiments.makers.make_figure RUN OUTPUT.png [--views N]`.
 
-One row a held-out view: the dark input, our estimate of it, the well-lit scene.
+It has a row for each held-out view: the dark input, our estimate of it, the well-lit scene.
 """
 
 import argparse

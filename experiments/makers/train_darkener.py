@@ -1,8 +1,8 @@
-"""The network of `simulate --method network`.
+"""Train the network of `simulate --method network`.
 
     python -m experiments.makers.train_darkener [IMAGES ...] [--output FILE]
 
-Without images it trains on photographs that scikit-image brings along: astronaut (NASA, public domain), camera (CC0,
+Without images it trains on photographs that come with scikit-image: astronaut (NASA, public domain), camera (CC0,
 Lav Varshney), chelsea (CC0, Stefan van der Walt), coffee (CC0, Rachel Michetti) and rocket (SpaceX, public domain).
 """
 
@@ -24,10 +24,10 @@ from l2dgs_jax.runtime import command_line
 from l2dgs_jax.training.optimizer import Schedule
 
 PHOTOGRAPHS = ("astronaut", "camera", "chelsea", "coffee", "rocket")
-CROP, BATCH = 64, 8  # pixels, images
-EXPOSURES = (0.02, 0.3)  # drawn log-uniformly
-SHRINK = (1.0, 2.2)  # shorter side of a picture over CROP
-TONE = (0.6, 1.6)  # exponent of each crop, so that pictures of every brightness are seen
+CROP, BATCH = 64, 8  # side of a crop in pixels; crops per step
+EXPOSURES = (0.02, 0.3)  # range, drawn log-uniformly
+SHRINK = (1.0, 2.2)  # range of the shorter side to which a picture is shrunk, over CROP
+TONE = (0.6, 1.6)  # range of the exponent applied to a crop, so that the network sees pictures of every brightness
 RATES = (2e-3, 1e-4)  # first and last learning rate
 
 

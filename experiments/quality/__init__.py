@@ -1,1 +1,1 @@
-"""How good poses, masks and results are, against what is known."""
+"""Accuracy of poses, masks and results, against known ones."""

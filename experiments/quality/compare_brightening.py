@@ -1,9 +1,9 @@
-"""Which brighter copy of dark frames gets the most of them registered.
+"""With which way of brightening dark frames most of them get a pose.
 
     python -m experiments.quality.compare_brightening FRAMES_OR_VIDEO
 
-Prepares the same frames with each of the curves below, on one thread, and prints what comes of it. The copy that flow
-and features see is all that differs.
+Prepares the same frames with each of the curves below, on one thread, and prints the results. Only the copies in which
+flow and features are found differ.
 """
 
 import argparse

@@ -1,11 +1,11 @@
-"""How close the poses that `prepare` finds come to those that a Nerfies scene gives.
+"""How close the poses that `prepare` finds are to those of a Nerfies scene.
 
-    python -m experiments.quality.compare_poses video SCENE clip.avi  # frames as a video: .avi without loss, .mp4 with
+    python -m experiments.quality.compare_poses video SCENE clip.avi  # makes a video: .avi is lossless, .mp4 is not
     python -m l2dgs_jax.prepare clip.avi OUT                          # or the folder of frames instead of the video
     python -m experiments.quality.compare_poses compare SCENE OUT
 
-After the similarity that brings the camera centres closest to the given ones (Umeyama, PAMI 1991): the median and the
-largest distance between centres, in parts of the trajectory's length, and angle between orientations.
+The found camera centres are aligned with the given ones by a similarity (Umeyama, PAMI 1991). Printed are the median
+and the largest distance between centres, relative to the trajectory's length, and angle between orientations.
 """
 
 import argparse
@@ -74,7 +74,7 @@ def compare(scene: Path, paths: list[Path], prepared: Path) -> dict:
 
 
 def _frame(origin: str, paths: list[Path]) -> str:
-    """The scene's name of a frame, from its place in the video or the name of its picture."""
+    """The scene's name of a frame, from its position in the video or the name of its picture."""
     return paths[int(origin.removeprefix("frame "))].stem if origin.startswith("frame ") else Path(origin).stem
 
 

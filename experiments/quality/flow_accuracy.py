@@ -1,8 +1,8 @@
-"""How much of a frame its neighbours tell: `python -m experiments.quality.flow_accuracy SCENE... [--downscale K]`.
+"""How well frames follow from their neighbours: `python -m experiments.quality.flow_accuracy SCENE... [--downscale K]`.
 
-Every second frame is drawn from those before and after it, as training draws views between frames. A pixel comes out
-right if it differs from the frame by less than three medians of what pixels differ by, both blurred by a pixel.
-Counted is what moves, by the masks of the scene or, where it has none, by computed ones.
+Every second frame is synthesised from those before and after it, as training synthesises views between frames. A pixel
+is right if it differs from the true frame by less than three times the median difference, after blurring both by a
+pixel. Only moving pixels count, by the masks of the scene or, if it has none, by computed ones.
 """
 
 import argparse
@@ -18,7 +18,7 @@ from l2dgs_jax.training.flows import neighbour_flows
 from l2dgs_jax.training.inbetweens import draw
 from l2dgs_jax.types import Camera
 
-NEAR = 3.0  # medians
+RIGHT_BELOW = 3.0  # times the median difference
 
 
 def main() -> None:
@@ -37,7 +37,7 @@ def main() -> None:
 
 
 def shares(split: Split, moving: Bool[np.ndarray, "F H W"], order: np.ndarray, filled: bool) -> np.ndarray:
-    """Parts of what moves that come out right and wrong, in the mean of the frames that are drawn."""
+    """Shares of the moving pixels that are right and wrong, the mean over the synthesised frames."""
     kept = order[::2]
     few = _some(split, kept)
     flows = neighbour_flows(few, filled=filled)
@@ -47,7 +47,7 @@ def shares(split: Split, moving: Bool[np.ndarray, "F H W"], order: np.ndarray, f
         part = float((times[middle] - times[first]) / (times[second] - times[first]))
         view = draw(few, flows, index, part)
         apart = np.abs(_blurred(view.image) - _blurred(split.images[middle])).mean(-1)
-        right = apart < NEAR * np.median(apart[view.valid])
+        right = apart < RIGHT_BELOW * np.median(apart[view.valid])
         counted = moving[middle]
         if counted.any():
             found.append([(view.valid & is_so & counted).sum() / counted.sum() for is_so in (right, ~right)])

@@ -1,7 +1,7 @@
 """How well computed masks match a scene's own: `python -m experiments.quality.mask_accuracy SCENE [--downscale K]`.
 
-The masks of the scene are the truth and play no part in the computation. Intersection over union of the moving pixels,
-as the mean over the frames and from all pixels of all frames.
+The scene's own masks are the ground truth, and are not used for computing masks. Printed is the intersection over union
+of the moving pixels, as the mean over the frames and over all pixels of all frames.
 """
 
 import argparse

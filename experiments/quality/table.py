@@ -1,9 +1,9 @@
-"""`python -m experiments.quality.table STUDY...`: what studies found, in one table of means and spreads over seeds.
+"""`python -m experiments.quality.table STUDY...`: results of studies in tables of means and spreads over seeds.
 
-Each argument is a folder that `python -m l2dgs_jax.sweep` has filled, or a file that `--json FILE` has kept the numbers
-of a table in. A row is a combination of settings, a column a score on one scene: mean and, with several seeds, half the
-range over them. What diverged is named and left out. Of a single combination there is one table, with a row for each
-scene.
+Each argument is a folder that `python -m l2dgs_jax.sweep` has filled, or a file of numbers that `--json FILE` has
+written. Each scene has a table, with a row for each combination of settings and a column for each score: the mean and,
+with several seeds, half the range over them. Members that diverged are named and left out. If there is only one
+combination of settings, there is one table with a row for each scene.
 """
 
 import json
@@ -21,7 +21,7 @@ from experiments.members import left_out
 from l2dgs_jax.study.report import FINISHED
 
 Row = tuple[tuple[str, str], ...]  # names and values of settings
-Found = dict[Row, dict[str, dict[str, list[float]]]]  # scores over the seeds, by settings, scene and name
+Found = dict[Row, dict[str, dict[str, list[float]]]]  # by settings, scene and name of a score: its values for all seeds
 SCORES = {
     "low": ("lowlight", "psnr"),
     "moving": ("lowlight_regions", "dynamic", "psnr"),
@@ -38,9 +38,9 @@ class Table:
     """Compare studies.
 
     Attributes:
-        studies: folders that `sweep` has filled, or files that `json` has named.
-        json: file for the numbers.
-        brief: low-light PSNR, PSNR after the gain and SSIM alone, rounded, all scenes in one table.
+        studies: folders that `sweep` has filled, or files that --json has written.
+        json: file to write the numbers to.
+        brief: print only low-light PSNR, PSNR after the gain and SSIM, rounded, with all scenes in one table.
     """
 
     studies: tyro.conf.Positional[tuple[Path, ...]]
@@ -49,7 +49,7 @@ class Table:
 
 
 def collect(studies: Sequence[Path]) -> Found:
-    """Scores of all studies together; what diverged is named on standard error, and its seed not counted."""
+    """Scores of all studies together; members that diverged are named on standard error and left out."""
     found: Found = defaultdict(lambda: defaultdict(lambda: defaultdict(list)))
     for study in studies:
         if study.is_file():
@@ -71,7 +71,7 @@ def collect(studies: Sequence[Path]) -> Found:
 
 
 def _kept(path: Path) -> list[dict[str, Any]]:
-    """The rows of a file; what another file beside it has already is named there by that file and its row."""
+    """The rows of a file; a row can refer to another file beside it, by its name and the index of a row there."""
     rows = json.loads(path.read_text())
     for row in rows:
         if isinstance(row["scenes"], list):
@@ -87,7 +87,7 @@ def _score(scores: Any, path: Sequence[str]) -> float | None:
 
 
 def markdown(found: Found) -> str:
-    """One table a scene, with a row for each combination of settings; or the other way round if that is only one."""
+    """A table for each scene, with a row for each combination of settings; for one combination, one row per scene."""
     scenes = _scenes(found)
     if len(found) == 1:
         ((row, rows),) = found.items()

@@ -1,8 +1,8 @@
-"""Where points of a rigid scene may appear in another view, and how far matches are from there.
+"""Epipolar geometry: where static points can appear in another view, and how far matches lie from there.
 
-A point on the pixel p = (u, v, 1) of one view, at depth 1 / w, appears in another view at the direction H p + w e: as w
-grows it runs from where the infinitely far would be along the epipolar line towards the epipole e (Hartley and
-Zisserman, Multiple View Geometry, section 9).
+A point seen at the pixel p = (u, v, 1) of one view, at inverse depth w, appears in another view at H p + w e in
+homogeneous pixels: as w grows it moves along the epipolar line, from the image of the point at infinity towards the
+epipole e (Hartley and Zisserman, Multiple View Geometry, section 9).
 """
 
 from collections.abc import Sequence
@@ -13,7 +13,8 @@ from jaxtyping import Float
 
 from l2dgs_jax.types import Camera
 
-_NEAREST = 1e-6  # of the depth in the first view: what is no deeper in the second is behind it
+# Lower bound on a point's depth in the second view over that in the first: points behind the camera end up far away.
+_MIN_DEPTH_RATIO = 1e-6
 
 
 class EpipolarGeometry(NamedTuple):
@@ -21,7 +22,7 @@ class EpipolarGeometry(NamedTuple):
 
     Attributes:
         H: the homography of the plane at infinity.
-        e: the epipole times the distance, in homogeneous pixels.
+        e: the epipole in homogeneous pixels, scaled by the baseline.
     """
 
     H: Float[np.ndarray, "*K 3 3"]
@@ -41,8 +42,8 @@ def epipolar_geometry(cameras: Camera, first: int, second: int | Sequence[int]) 
 def project(
     geometry: EpipolarGeometry, pixels: Float[np.ndarray, "*S 2"], inverse_depth: Float[np.ndarray, "*S"]
 ) -> Float[np.ndarray, "*S 2"]:
-    """Pixels of the second view that show what lies at `inverse_depth` on pixels of the first."""
-    return _pixels(pixels @ geometry.H[:, :2].T + geometry.H[:, 2] + inverse_depth[..., None] * geometry.e)
+    """Pixels of the second view that show what the given pixels of the first see at `inverse_depth`."""
+    return _dehomogenised(pixels @ geometry.H[:, :2].T + geometry.H[:, 2] + inverse_depth[..., None] * geometry.e)
 
 
 def static_residuals(
@@ -51,20 +52,20 @@ def static_residuals(
     matches: Float[np.ndarray, "K *S 2"],
     inverse_depths: tuple[float, float],
 ) -> Float[np.ndarray, "C K *S"]:
-    """How far matches in K views are from where a still point would appear, for C guesses of its depth.
+    """Distance of matches in K views from where a static point would appear, for C candidates of its depth.
 
-    Each match proposes the depth, within the given range, that places the point nearest to itself on its epipolar line;
-    so does the median of these. For two views the residual of the match's own guess is the epipolar distance if the
-    epipolar lines are parallel, or if it is zero; and it is more if the point would lie behind or too far.
+    Each match proposes the inverse depth that fits it best, clipped to the given range; the median of these is one more
+    candidate. The residual of a match at its own proposal is its epipolar distance if that is zero or the epipolar
+    lines are parallel, and larger if the proposal was clipped: the point would lie behind the camera or out of range.
 
     Args:
         geometry: from the first view to each of K others.
         pixels: of the first view.
         matches: of the same points in the other views.
-        inverse_depths: the least and the greatest to think of, in the first view, 1 / world units.
+        inverse_depths: the least and the greatest to consider, in the first view, 1 / world units.
 
     Returns:
-        Pixels, for C = K + 1 guesses in each of K views.
+        Residuals in pixels, of C = K + 1 candidates in each of K views.
     """
     far, a, b = depth_equations(geometry, pixels, matches)
     proposals = np.clip(proposed(a, b), *inverse_depths)
@@ -73,12 +74,12 @@ def static_residuals(
 
 
 class DepthEquations(NamedTuple):
-    """Of every match, two equations a + w b = 0 of the inverse depth w: far + w e is parallel to (match, 1).
+    """Two equations a + w b = 0 in the inverse depth w for every match: far + w e is to be parallel to (match, 1).
 
     Attributes:
-        far: directions in which the infinitely far would be seen.
-        a: see above.
-        b: likewise.
+        far: H p, where the point at infinity appears, homogeneous pixels.
+        a: constant terms.
+        b: coefficients of w.
     """
 
     far: Float[np.ndarray, "K *S 3"]
@@ -89,15 +90,15 @@ class DepthEquations(NamedTuple):
 def depth_equations(
     geometry: EpipolarGeometry, pixels: Float[np.ndarray, "*S 2"], matches: Float[np.ndarray, "K *S 2"]
 ) -> DepthEquations:
-    """What matches of pixels with K other views say of their inverse depth, in the type of the matches."""
-    kind = matches.dtype
-    e = geometry.e.astype(kind)[_over(pixels)]
-    far = np.stack([pixels @ H[:, :2].T + H[:, 2] for H in geometry.H.astype(kind)])
+    """What matches of pixels in K other views say about their inverse depth, in the type of the matches."""
+    dtype = matches.dtype
+    e = geometry.e.astype(dtype)[_per_view(pixels)]
+    far = np.stack([pixels @ H[:, :2].T + H[:, 2] for H in geometry.H.astype(dtype)])
     return DepthEquations(far, far[..., :2] - matches * far[..., 2:], e[..., :2] - matches * e[..., 2:])
 
 
 def proposed(a: Float[np.ndarray, "*S 2"], b: Float[np.ndarray, "*S 2"]) -> Float[np.ndarray, "*S"]:
-    """The inverse depths that solve the `DepthEquations` best, each match's for itself."""
+    """The least-squares inverse depth of every match by itself, from its `DepthEquations`."""
     return -(a * b).sum(-1) / np.maximum((b * b).sum(-1), np.finfo(b.dtype).tiny)
 
 
@@ -107,15 +108,15 @@ def epipolar_residuals(
     matches: Float[np.ndarray, "K *S 2"],
     inverse_depth: Float[np.ndarray, "*S"],
 ) -> Float[np.ndarray, " K *S"]:
-    """Pixels between matches and where they would be at that inverse depth; `far` is of their `DepthEquations`."""
-    e = geometry.e.astype(matches.dtype)[_over(inverse_depth[..., None])]
-    return np.linalg.norm(_pixels(far + inverse_depth[..., None] * e) - matches, axis=-1)
+    """Reprojection errors in pixels of matches at that inverse depth; `far` is that of their `DepthEquations`."""
+    e = geometry.e.astype(matches.dtype)[_per_view(inverse_depth[..., None])]
+    return np.linalg.norm(_dehomogenised(far + inverse_depth[..., None] * e) - matches, axis=-1)
 
 
-def _over(pixels: Float[np.ndarray, "*S 2"] | Float[np.ndarray, "*S 1"]) -> tuple:
-    """The index that lets one row for each of K views meet all pixels."""
+def _per_view(pixels: Float[np.ndarray, "*S 2"] | Float[np.ndarray, "*S 1"]) -> tuple:
+    """The index that makes an array of one row per view broadcast over all pixels."""
     return slice(None), *(None,) * (pixels.ndim - 1)
 
 
-def _pixels(directions: Float[np.ndarray, "*S 3"]) -> Float[np.ndarray, "*S 2"]:
-    return directions[..., :2] / np.maximum(directions[..., 2:], directions.dtype.type(_NEAREST))
+def _dehomogenised(directions: Float[np.ndarray, "*S 3"]) -> Float[np.ndarray, "*S 2"]:
+    return directions[..., :2] / np.maximum(directions[..., 2:], directions.dtype.type(_MIN_DEPTH_RATIO))

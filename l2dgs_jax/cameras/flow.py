@@ -8,18 +8,18 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
-BLUR = 1.0  # standard deviation in pixels of what takes noise off before matching
-REMEMBERED = 48  # pairs of frames whose flow is kept
-LOST = 3.0  # pixels from where flow returns to that void a match
-REFINEMENTS = 10  # of smooth flow in the frames, each of so many steps
+BLUR_SIGMA = 1.0  # standard deviation in pixels of the Gaussian that suppresses noise before matching
+CACHED_FLOWS = 48  # frame pairs whose flow is kept
+LOST = 3.0  # forward-backward error in pixels from which a match counts as lost
+REFINEMENT_STEPS = 10  # fixed-point iterations that refine smooth flow at full size, and SOR iterations in each
 
 
 class Matches(NamedTuple):
     """A frame's matches with K others.
 
     Attributes:
-        positions: where each pixel is found.
-        errors: pixels between where a match starts and where flow from its end returns to.
+        positions: where each pixel is found, pixel centres at +0.5.
+        errors: forward-backward errors in pixels, above `LOST` for matches outside the image.
     """
 
     positions: Float32[np.ndarray, "K H W 2"]
@@ -27,7 +27,7 @@ class Matches(NamedTuple):
 
 
 def brightened(images: Float[np.ndarray, "F H W 3"]) -> UInt8[np.ndarray, "F H W"]:
-    """Grey copies for matching: noise blurred away, then one stretch of contrast for all frames."""
+    """Grey copies for matching: noise blurred away, then the same contrast stretch for all frames."""
     sample = [_smooth_grey(images[i]) for i in range(0, len(images), max(len(images) // 16, 1))]
     low, high = np.percentile(sample, (0.5, 99.5))
     span = max(high - low, 1e-6)
@@ -36,13 +36,13 @@ def brightened(images: Float[np.ndarray, "F H W 3"]) -> UInt8[np.ndarray, "F H W
 
 
 def _smooth_grey(image: Float[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "H W"]:
-    return cv2.GaussianBlur(cv2.cvtColor(image.astype(np.float32), cv2.COLOR_RGB2GRAY), (0, 0), BLUR)
+    return cv2.GaussianBlur(cv2.cvtColor(image.astype(np.float32), cv2.COLOR_RGB2GRAY), (0, 0), BLUR_SIGMA)
 
 
 def optical_flow(
     first: UInt8[np.ndarray, "H W"], second: UInt8[np.ndarray, "H W"], finest_scale: int = 0
 ) -> Float32[np.ndarray, "H W 2"]:
-    """Dense optical flow by inverse search (DIS, arXiv 1603.03590), down to pixels of 2^`finest_scale`."""
+    """Dense optical flow by inverse search (DIS, arXiv 1603.03590), down to a scale of 1 / 2^`finest_scale`."""
     search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     search.setFinestScale(finest_scale)
     return search.calc(first, second, None)  # type: ignore[call-overload]
@@ -51,10 +51,11 @@ def optical_flow(
 def smooth_flow(
     first: UInt8[np.ndarray, "H W"], second: UInt8[np.ndarray, "H W"], size: float
 ) -> Float32[np.ndarray, "H W 2"]:
-    """Dense optical flow that follows what patches lose, as what turns or is thin, but blurs the edges of what moves.
+    """Dense variational flow: follows what patches (`optical_flow`) lose, such as rotating or thin things.
 
-    It minimises DeepFlow's energy (ICCV 2013, without its matches) in pictures of `size` times the frames', and is
-    refined in these: the smaller, the larger are the motions that it follows, and the fewer the details.
+    Its motion boundaries are blurred, though. It minimises the energy of DeepFlow (ICCV 2013, without its descriptor
+    matching) on frames scaled by `size`, and is then refined at full size: the smaller `size`, the larger the motions
+    that it follows and the fewer the details.
     """
     height, width = first.shape
     small = max(round(size * width), 1), max(round(size * height), 1)
@@ -62,8 +63,8 @@ def smooth_flow(
     flow = cv2.optflow.createOptFlow_DeepFlow().calc(*smaller, None)  # type: ignore[call-overload]
     flow = cv2.resize(flow, (width, height)) * np.array([width, height], np.float32) / np.array(small, np.float32)
     refinement = cv2.VariationalRefinement.create()
-    refinement.setFixedPointIterations(REFINEMENTS)
-    refinement.setSorIterations(REFINEMENTS)
+    refinement.setFixedPointIterations(REFINEMENT_STEPS)
+    refinement.setSorIterations(REFINEMENT_STEPS)
     return refinement.calc(first, second, flow)
 
 
@@ -73,22 +74,23 @@ def pixel_indices(height: int, width: int) -> Float32[np.ndarray, "H W 2"]:
     return np.stack([columns, rows], axis=-1)
 
 
-def match(there: Float32[np.ndarray, "H W 2"], back: Float32[np.ndarray, "H W 2"]) -> Matches:
-    """Matches from flow to another view and from there back."""
-    height, width = there.shape[:2]
-    ends = there + pixel_indices(height, width)
-    returned = cv2.remap(back, ends[..., 0], ends[..., 1], cv2.INTER_LINEAR)
-    left = (ends < 0).any(-1) | (ends > (width - 1, height - 1)).any(-1)
-    errors = np.where(left, np.float32(2 * LOST), np.linalg.norm(there + returned, axis=-1))
+def match(forward: Float32[np.ndarray, "H W 2"], backward: Float32[np.ndarray, "H W 2"]) -> Matches:
+    """Matches from the flow to another view and the flow back from there."""
+    height, width = forward.shape[:2]
+    ends = forward + pixel_indices(height, width)
+    returned = cv2.remap(backward, ends[..., 0], ends[..., 1], cv2.INTER_LINEAR)
+    outside = (ends < 0).any(-1) | (ends > (width - 1, height - 1)).any(-1)
+    errors = np.where(outside, np.float32(2 * LOST), np.linalg.norm(forward + returned, axis=-1))
     return Matches(ends + np.float32(0.5), errors.astype(np.float32))  # pixel centres lie at +0.5
 
 
 def matcher(greys: UInt8[np.ndarray, "F H W"]) -> Callable[[int, Sequence[int]], Matches]:
     """A function of a frame and others that finds its matches with them.
 
-    Flow is kept of some pairs: in the order of time most come back, the other way round, before they are forgotten.
+    Recent flows are cached: if frames are visited in order of time, most pairs are asked for again, with the roles of
+    their frames swapped, before they are evicted.
     """
-    flow = functools.lru_cache(REMEMBERED)(lambda first, second: optical_flow(greys[first], greys[second]))
+    flow = functools.lru_cache(CACHED_FLOWS)(lambda first, second: optical_flow(greys[first], greys[second]))
 
     def matches(frame: int, others: Sequence[int]) -> Matches:
         found = [match(flow(frame, other), flow(other, frame)) for other in others]

@@ -11,12 +11,12 @@ from l2dgs_jax.types import Camera
 
 AnyArray = TypeVar("AnyArray", Array, np.ndarray)
 
-OPENGL_AXES = np.diag([1.0, -1.0, -1.0, 1.0])  # of a camera (right, up, back) from OpenCV's (right, down, forward)
+OPENGL_AXES = np.diag([1.0, -1.0, -1.0, 1.0])  # from OpenCV's camera axes (right, down, forward) to (right, up, back)
 
 
 def camera_centres(viewmats: AnyArray) -> AnyArray:
     """Centres [*B 3] of cameras in world units, of rigid `viewmats` [*B 4 4]; carries gradients."""
-    # Sums of products and not a matrix product, which accelerators round to few digits.
+    # Sums of products instead of a matrix product, which accelerators compute at reduced precision.
     return -(viewmats[..., :3, :3] * viewmats[..., :3, 3:]).sum(-2)
 
 
@@ -36,7 +36,10 @@ def points_inside(
     K: Float[np.ndarray, "3 3"],
     size: tuple[int, ...],
 ) -> tuple[Bool[np.ndarray, " P"], Float[np.ndarray, "S 2"], Float[np.ndarray, " S"]]:
-    """Which points, world units, a picture of that width and height shows, none being hidden; their pixels, depths."""
+    """Which points (world units) project into an image of that width and height, and the pixels and depths of those.
+
+    Occlusion is ignored.
+    """
     pixels, depth = project_points(points, viewmat, K)
     inside: np.ndarray = np.all((pixels >= 0) & (pixels < size), axis=-1)  # not where they are NaN
     return inside, pixels[inside], depth[inside]
@@ -76,9 +79,9 @@ def select_camera(cameras: Camera, index: int) -> Camera:
 
 
 def between(cameras: Camera, first: int, second: int, part: float) -> Camera:
-    """A camera `part` of the way from one of a batch to another: its centre, intrinsics and time are weighted means.
+    """A camera `part` of the way from one of a batch to another, in NumPy arrays of the batch's type.
 
-    Its orientation turns evenly from one's to the other's. In NumPy arrays of the batch's type.
+    Its centre, intrinsics and time are weighted means; its orientation is interpolated spherically (slerp).
     """
     viewmats = np.asarray(cameras.viewmat, np.float64)[[first, second]]
     weights = np.array([1 - part, part])
@@ -107,7 +110,7 @@ def reframe(cameras: Camera, size: tuple[int, int], wanted: tuple[int, int]) -> 
     Args:
         cameras: one camera, or a batch of them.
         size: width and height of their images, pixels.
-        wanted: likewise, of the images to come.
+        wanted: width and height of the images that they are to have, pixels.
     """
     factor = max(new / old for new, old in zip(wanted, size, strict=True))
     margins = [(new - factor * old) / 2 for new, old in zip(wanted, size, strict=True)]

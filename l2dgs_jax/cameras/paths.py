@@ -1,4 +1,4 @@
-"""Paths that cameras fly along, as batches of cameras in NumPy arrays of the type of the trained views'."""
+"""Camera paths, as batches of cameras in NumPy arrays of the same type as the trained views'."""
 
 from typing import Any
 
@@ -10,11 +10,11 @@ from scipy.spatial.transform import Rotation
 from l2dgs_jax.cameras.geometry import camera_centres, mean_up
 from l2dgs_jax.types import Camera
 
-ALL_AROUND = np.radians(120)  # cameras stand around a scene if no gap between them is wider, seen from its middle
+MAX_AZIMUTH_GAP = np.radians(120)  # cameras surround a scene if none of the gaps between neighbours is wider
 
 
 def space_time_path(cameras: Camera, frames: int) -> Camera:
-    """A smooth path along the trained views: a quarter of it at the first instant, then time runs from 0 to 1.
+    """A smooth path along the trained views: time rests at 0 for a quarter of it, then runs from 0 to 1.
 
     It is that of `interpolate` plus a gentle sway within the image plane.
 
@@ -22,8 +22,8 @@ def space_time_path(cameras: Camera, frames: int) -> Camera:
         cameras: F trained views in any order.
         frames: how many cameras to return.
     """
-    still = frames // 4
-    path = interpolate(cameras, np.concatenate([np.zeros(still), np.linspace(0, 1, frames - still)]))
+    resting = frames // 4
+    path = interpolate(cameras, np.concatenate([np.zeros(resting), np.linspace(0, 1, frames - resting)]))
     centres = camera_centres(np.asarray(cameras.viewmat, np.float64))
     phase = np.linspace(0, 4 * np.pi, frames)
     sway = 0.2 * _rms(centres - centres.mean(0)) * np.stack([np.sin(phase), 0.3 * np.sin(2 * phase)], axis=-1)
@@ -32,10 +32,10 @@ def space_time_path(cameras: Camera, frames: int) -> Camera:
 
 
 def interpolate(cameras: Camera, times: Float[np.ndarray, " T"]) -> Camera:
-    """The way of the trained views, without the shake of the hand.
+    """The path of the trained views, smoothed to remove the shake of the hand.
 
     The pose at an instant is the Gaussian-weighted mean of the views around it. Where the views jump about from frame
-    to frame, their mean would be no place to stand: the most central view stands for all of them.
+    to frame, their mean would not be a sensible pose: the pose of the most central view is used throughout.
 
     Args:
         cameras: F trained views in any order.
@@ -51,23 +51,23 @@ def interpolate(cameras: Camera, times: Float[np.ndarray, " T"]) -> Camera:
         rotations, centres, intrinsics = (
             np.broadcast_to(x[central], x.shape) for x in (rotations, centres, intrinsics)
         )
-    weights = _nearby(times, trained, bandwidth)
-    turned = np.stack([Rotation.from_matrix(rotations).mean(w).as_matrix() for w in weights])
-    return _cameras(turned, weights @ centres, np.einsum("tf,fij->tij", weights, intrinsics), times, cameras)
+    weights = _temporal_weights(times, trained, bandwidth)
+    orientations = np.stack([Rotation.from_matrix(rotations).mean(w).as_matrix() for w in weights])
+    return _cameras(orientations, weights @ centres, np.einsum("tf,fij->tij", weights, intrinsics), times, cameras)
 
 
 def is_path(cameras: Camera) -> bool:
-    """Whether views follow one another, and do not jump about from frame to frame."""
+    """Whether the views form a continuous path, instead of jumping about from frame to frame."""
     trained = np.asarray(cameras.time, np.float64)
     centres = camera_centres(np.asarray(cameras.viewmat, np.float64))
-    aside = centres - _nearby(trained, trained, _bandwidth(trained)) @ centres
-    return _rms(aside) <= 0.5 * _rms(centres - centres.mean(0))
+    deviations = centres - _temporal_weights(trained, trained, _bandwidth(trained)) @ centres
+    return _rms(deviations) <= 0.5 * _rms(centres - centres.mean(0))
 
 
 def spiral(cameras: Camera, depth: float, times: Float[np.ndarray, " T"]) -> Camera:
     """Two turns around the most central view, looking at the centre of attention (as LLFF, arXiv 1905.00889).
 
-    They are as wide as the trained views spread, within bounds: some parallax shows, and the scene stays in view.
+    They are as wide as the trained views spread, within bounds that show some parallax and keep the scene in view.
 
     Args:
         cameras: F trained views in any order.
@@ -89,8 +89,8 @@ def spiral(cameras: Camera, depth: float, times: Float[np.ndarray, " T"]) -> Cam
 def orbit(cameras: Camera, depth: float, times: Float[np.ndarray, " T"]) -> Camera:
     """Around the centre of attention at the trained views' distance and height, looking at it.
 
-    Once around where the trained views stand on all sides; else to and fro between the outermost of them, because
-    nobody has seen the scene from behind.
+    Once around if the trained views surround the scene; otherwise to and fro between the outermost of them, because no
+    view has seen the scene from behind.
 
     Args:
         cameras: F trained views in any order.
@@ -110,7 +110,7 @@ def orbit(cameras: Camera, depth: float, times: Float[np.ndarray, " T"]) -> Came
     angles = np.sort(np.arctan2(level @ beside, level @ ahead))
     gaps = np.diff(angles, append=angles[0] + 2 * np.pi)
     phase = np.linspace(0, 2 * np.pi, len(times))
-    if gaps.max() > ALL_AROUND:
+    if gaps.max() > MAX_AZIMUTH_GAP:
         first = angles[(gaps.argmax() + 1) % len(angles)]
         half = (2 * np.pi - gaps.max()) / 2
         phase = first + half + max(half, 0.1) * np.sin(phase)  # a tripod's views sway a little, too
@@ -122,8 +122,8 @@ def orbit(cameras: Camera, depth: float, times: Float[np.ndarray, " T"]) -> Came
 def centre_of_attention(cameras: Camera, depth: float) -> Float[np.ndarray, "3"]:
     """The point that cameras look at, world units: nearest to their optical axes, and about `depth` away.
 
-    The axes of cameras that look the same way meet nowhere in particular. A tenth of the weight, which is little where
-    they do meet, draws it to the points that lie `depth` away on each.
+    Nearly parallel axes do not determine such a point. So the points at `depth` on each axis attract it, too, with a
+    tenth of the weight, which matters little where the axes do meet.
     """
     viewmats = np.asarray(cameras.viewmat, np.float64)
     centres, forward = camera_centres(viewmats), viewmats[:, 2, :3]
@@ -166,11 +166,13 @@ def _most_central(centres: Float[np.ndarray, "F 3"]) -> int:
 
 
 def _bandwidth(times: Float[np.ndarray, " F"]) -> float:
-    """Of the weights with which views are averaged: a part of the whole duration, and never less than a few views."""
+    """Standard deviation in time of the weights of `_temporal_weights`: 0.04, or more if there are few views."""
     return max(0.04, 1.5 / len(times))
 
 
-def _nearby(at: Float[np.ndarray, " A"], times: Float[np.ndarray, " F"], bandwidth: float) -> Float[np.ndarray, "A F"]:
+def _temporal_weights(
+    at: Float[np.ndarray, " A"], times: Float[np.ndarray, " F"], bandwidth: float
+) -> Float[np.ndarray, "A F"]:
     """Gaussian weights of the views around each instant; rows sum to 1."""
     exponent = -0.5 * ((at[:, None] - times[None]) / bandwidth) ** 2
     weights = np.exp(exponent - exponent.max(-1, keepdims=True))

@@ -1,4 +1,4 @@
-"""Every setting, the named presets, and settings by their dotted names."""
+"""All settings, the named presets, and access to settings by their dotted names."""
 
 from l2dgs_jax.config.presets import PRESETS
 from l2dgs_jax.config.settings import (

@@ -1,4 +1,4 @@
-"""Settings by their dotted names, such as "loss.exposure_level": read, checked, replaced, and split from a program."""
+"""Settings by dotted names such as "loss.exposure_level": read, check, replace, or pass them to a compiled program."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -22,16 +22,16 @@ _FIELDS = _fields(Config)
 _KINDS = {name: TRACEABLE.get(kind, kind) for name, kind in _FIELDS.items()}
 
 # Numbers that a training step only calculates with: scenes that differ in nothing else can share a compiled program.
-# (Those of the learning rates' schedules and of the initial state are not even read by a step.)
+# (Learning rates, their decay and initial values are not even read by a step.)
 TRACED = frozenset(name for name, kind in _FIELDS.items() if kind in TRACEABLE)
 
 
 @dataclass(frozen=True)
 class StaticConfig:
-    """The settings that a program is compiled for: a `Config` with holes, to be filled by `combine`.
+    """The settings that a program is compiled for: a `Config` with holes that `combine` fills.
 
     Attributes:
-        outline: the settings, 0 in the holes.
+        outline: the settings, with 0 in the holes.
         holes: dotted names of the settings that the program takes as arguments.
     """
 
@@ -40,7 +40,7 @@ class StaticConfig:
 
 
 def partition(configs: Sequence[Config]) -> tuple[StaticConfig, dict[str, list[Any]]]:
-    """What configs have in common, and the numbers in which they differ, each with its value in every one of them.
+    """Split configs into what they have in common and the numbers in which they differ, by name: a value per config.
 
     Raises:
         ValueError: they differ in a setting that a program cannot take as an argument.
@@ -77,13 +77,13 @@ def replace(config: Config, values: Mapping[str, Any]) -> Config:
 
 
 def checked(name: str, value: Any) -> Any:
-    """The value as that setting holds it: whole numbers as floats, lists as tuples, "None" as None where they fit.
+    """The value converted to the setting's type: integers to floats, lists to tuples, "None" to None where they fit.
 
     Raises:
         ValueError: there is no such setting, or it takes no such value.
     """
     if name not in _KINDS:
-        raise ValueError(f"{name} is no setting; expected one of those that `python -m l2dgs_jax.train --help` lists")
+        raise ValueError(f"{name} is not a setting; expected one that `python -m l2dgs_jax.train --help` lists")
     for candidate in (value, None) if value == "None" else (value,):
         fits, converted = _fit(candidate, _KINDS[name])
         if fits:
@@ -93,18 +93,18 @@ def checked(name: str, value: Any) -> Any:
 
 
 def outline(config: Config) -> Config:
-    """The settings with every number of `TRACED` blanked: equal for scenes that can share a compiled program."""
+    """The settings with those of `TRACED` set to 0: equal for scenes that can share a compiled program."""
     return replace(config, {name: _blank(read(config, name)) for name in TRACED})
 
 
 def differences(configs: Sequence[Config]) -> dict[str, list[Any]]:
-    """The settings in which some of the configs differ, each with its value in every one of them."""
+    """The settings in which some of the configs differ, each with its value in every config."""
     values = {name: [read(config, name) for config in configs] for name in _KINDS}
     return {name: column for name, column in values.items() if any(value != column[0] for value in column)}
 
 
 def read(config: Config, name: str) -> Any:
-    """The setting of a dotted name."""
+    """The value of a setting, by its dotted name."""
     value: Any = config
     for part in name.split("."):
         value = getattr(value, part)

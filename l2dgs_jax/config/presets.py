@@ -1,8 +1,8 @@
-"""The named presets; docs/record.md says why each setting of `default` is what it is, and what it measures.
+"""The named presets; docs/record.md has the reasons for each setting of `default`, and the measurements.
 
-`paper` is the text of the paper to the letter, `authors` what the authors' released code does, `default` what measures
-best, `fast` and `demo` a short `default`, `best` a long one. `4dgs`, `enhance-4dgs`, `curve-4dgs` and `static` are what
-to compare it with: baselines after those of the paper's Table 1, in as many steps.
+`paper` follows the text of the paper to the letter, `authors` the authors' released code. `default` has measured best;
+`fast` and `demo` are shorter, `best` is longer. `4dgs`, `enhance-4dgs`, `curve-4dgs` and `static` are baselines to
+compare `default` with, after those of the paper's Table 1, and take as many steps as it does.
 """
 
 import dataclasses
@@ -43,32 +43,32 @@ def _presets() -> dict[str, Config]:
         optim=OptimConfig(extent_scales=("means", "heads", "planes", "ocd", "bafe")),
     )
     default = Config(
-        coarse_steps=100,  # what moves is smeared in the coarse stage: no longer than geometry needs
+        coarse_steps=100,  # moving things are blurred in the coarse stage: only as long as geometry needs it
         fine_steps=1100,
         inbetweens=0.3,
         model=ModelConfig(
             unit="depth",
-            scale_growth="linear",  # exponentially, a few Gaussians come to fill the picture
+            scale_growth="linear",  # growing exponentially, a few Gaussians come to fill the image
             motion_gate=True,
             tracks=True,
             surfaces=True,  # in the dark, structure from motion finds few points
             hidden=64,
             plane_scales=(1, 2),
-            opacity_head=True,  # a copy of what moves can fade where it does not belong
+            opacity_head=True,  # lets a Gaussian fade at instants at which it does not belong where it is
             identity_start=True,  # the fine stage starts from the coarse stage's result instead of from a jump
             reflectance_init="observed",
-            bounded_reflectance=True,  # or what few frames see takes colours that no frame shows
+            bounded_reflectance=True,  # otherwise what few frames see takes on colours that no frame shows
             initial_exponents=("auto", 9.0),
             initial_illumination="auto",
             initial_opacity=0.3,
             tone="auto",
-            domain="auto",  # with values, B1 would have to do what the sRGB curve does
+            domain="auto",  # on sRGB values, B1 would have to imitate the sRGB curve
             relative_light=True,
             exposure="auto",
-            bafe=False,  # of light, one gain explains a dark frame
+            bafe=False,  # in linear light, a single gain explains a dark frame
         ),
         loss=LossConfig(
-            eta_end=0.75,  # brightened more than that, dark frames are mostly noise to SSIM
+            eta_end=0.75,  # if dark frames are brightened more, SSIM compares mostly noise
             exposure=1.0,
             exposure_level="auto",
             exposure_of="welllit",
@@ -81,17 +81,17 @@ def _presets() -> dict[str, Config]:
             gate=0.03,
         ),
         optim=OptimConfig(
-            extent_scales=("means", "paths"),  # motion field and heads have no unit
+            extent_scales=("means", "paths"),  # the parameters of the motion field are not lengths
             illumination_lr=1e-3,
             reflectance_lr=5e-3,  # 1e-5 moves a reflectance by 0.03 in 3,000 steps
             attenuation_lr=5e-3,
             heads_lr=1.5e-3,
             planes_lr=1.6e-2,
             ocd_lr=5e-5,
-            decay_steps=2400,  # motion would end half learned if its rates fell to their end within the run
+            decay_steps=2400,  # motion would remain half learned if its rates decayed fully within the run
         ),
-        # Births leave the image nearly as it is. Nothing is carried off: before its motion is learned, what moves is
-        # faint.
+        # New Gaussians leave the image nearly unchanged. None is relocated (prune_opacity 0), because moving things are
+        # faint before their motion is learned.
         density=DensityConfig(
             method="mcmc",
             start=100,
@@ -111,8 +111,8 @@ def _presets() -> dict[str, Config]:
         optim=dataclasses.replace(default.optim, decay_steps=7500),
         density=dataclasses.replace(default.density, stop=3000),
     )
-    # A smaller motion field, the scene's own points and fewer steps, in which nothing is added; so sizes must learn
-    # faster.
+    # A smaller motion field, only the scene's own points, fewer steps and no densification, so that scales must be
+    # learned faster.
     demo = dataclasses.replace(
         default,
         coarse_steps=150,
@@ -122,7 +122,7 @@ def _presets() -> dict[str, Config]:
         optim=dataclasses.replace(default.optim, scales_lr=0.04, quats_lr=4e-3, decay_steps=None),
         density=dataclasses.replace(default.density, stop=0),
     )
-    # 4DGS (arXiv 2310.08528): its model, objective, rates and schedule; steps and growth of `default`.
+    # 4DGS (arXiv 2310.08528): its model, objective, learning rates and decay; steps and densification of `default`.
     four_d = Config(
         coarse_steps=default.coarse_steps,
         fine_steps=default.fine_steps,
@@ -137,19 +137,19 @@ def _presets() -> dict[str, Config]:
         ),
         loss=LossConfig(ssim=0.0, exposure=0.0, amplification=0.0, structure=0.0, depth=0.0),
         optim=OptimConfig(
-            reflectance_lr=7e-4,  # 2.5e-3 for a coefficient of the constant harmonic, 0.28
+            reflectance_lr=7e-4,  # 4DGS: 2.5e-3 for the SH coefficient, which the constant harmonic multiplies by 0.28
             decay_steps=None,
         ),
         density=default.density,
     )
-    # The colours, tone curves and priors of Luminance-GS (arXiv 2504.01503), as far as they are model/tone_curves.py.
+    # The colours, tone curves and priors of Luminance-GS (arXiv 2504.01503), as far as model/tone_curves.py has them.
     curve = dataclasses.replace(
         four_d,
         model=dataclasses.replace(four_d.model, decomposition="curve", background=0.0),
-        # A quarter, on the images themselves, is its 0.2 of SSIM to 0.8 of the difference; 1 to 5 are its later priors.
+        # ssim 0.25, with eta 1, is its 0.2 of SSIM to 0.8 of L1; its later priors are weighted 1 to 5 as here.
         loss=dataclasses.replace(four_d.loss, ssim=0.25, eta_start=1.0, eta_end=1.0, equalisation=0.01, bend=0.05),
     )
-    # The first stage, in which nothing moves, for as long as `default`; paths would move.
+    # Only the coarse stage, in which the motion field does not act; without tracks, because their paths would move.
     static = dataclasses.replace(
         default,
         coarse_steps=default.steps,

@@ -1,4 +1,4 @@
-"""Every setting, as frozen dataclasses; the defaults are the paper's, where it gives any."""
+"""All settings, as frozen dataclasses; the defaults are the paper's, where it gives any."""
 
 import ast
 import dataclasses
@@ -16,8 +16,8 @@ LayoutName = Literal["nerfies", "colmap", "transforms", "llff"]
 Layout = Literal["auto"] | LayoutName
 Enhancement = Literal["none", "gamma", "clahe", "zero-dce"]
 
-# Settings that a compiled step may take as arguments are numbers outside of it and traced scalars inside
-# (`overrides.combine`); the command line reads the plain kinds.
+# Settings that a compiled step may take as arguments are Python numbers outside it and traced scalars inside
+# (`overrides.combine`); the command line parses them as the `_PLAIN_...` types.
 _Float = float | Float[Array, ""]
 _Int = int | Int[Array, ""]
 
@@ -28,33 +28,33 @@ def _arg(kind: Any) -> Any:
     )
 
 
-_PLAIN_NUMBER, _PLAIN_COUNT, _PLAIN_LENGTH = float, int, int | None
+_PLAIN_NUMBER, _PLAIN_COUNT, _PLAIN_OPTIONAL_COUNT = float, int, int | None
 _PLAIN_EXPONENTS = tuple[float | Literal["auto"], float] | None
-_PLAIN_MOST = int | Literal["auto"]
-_PLAIN_ILLUMINATION = float | Literal["auto"] | None
-_PLAIN_LEVEL = float | Literal["auto"]
-_PLAIN_OPTIONAL = float | None
+_PLAIN_AUTO_COUNT = int | Literal["auto"]
+_PLAIN_OPTIONAL_AUTO_NUMBER = float | Literal["auto"] | None
+_PLAIN_AUTO_NUMBER = float | Literal["auto"]
+_PLAIN_OPTIONAL_NUMBER = float | None
 Number = Annotated[_Float, _arg(_PLAIN_NUMBER)]
 Count = Annotated[_Int, _arg(_PLAIN_COUNT)]
-Length = Annotated[_Int | None, _arg(_PLAIN_LENGTH)]
+OptionalCount = Annotated[_Int | None, _arg(_PLAIN_OPTIONAL_COUNT)]
 Exponents = Annotated[tuple[_Float | Literal["auto"], _Float] | None, _arg(_PLAIN_EXPONENTS)]
-Most = Annotated[_Int | Literal["auto"], _arg(_PLAIN_MOST)]
-Illumination = Annotated[_Float | Literal["auto"] | None, _arg(_PLAIN_ILLUMINATION)]
-Level = Annotated[_Float | Literal["auto"], _arg(_PLAIN_LEVEL)]
-OptionalNumber = Annotated[_Float | None, _arg(_PLAIN_OPTIONAL)]
+AutoCount = Annotated[_Int | Literal["auto"], _arg(_PLAIN_AUTO_COUNT)]
+OptionalAutoNumber = Annotated[_Float | Literal["auto"] | None, _arg(_PLAIN_OPTIONAL_AUTO_NUMBER)]
+AutoNumber = Annotated[_Float | Literal["auto"], _arg(_PLAIN_AUTO_NUMBER)]
+OptionalNumber = Annotated[_Float | None, _arg(_PLAIN_OPTIONAL_NUMBER)]
 TRACEABLE: dict[Any, Any] = {
     Number: _PLAIN_NUMBER,
     Count: _PLAIN_COUNT,
-    Length: _PLAIN_LENGTH,
+    OptionalCount: _PLAIN_OPTIONAL_COUNT,
     Exponents: _PLAIN_EXPONENTS,
-    Most: _PLAIN_MOST,
-    Illumination: _PLAIN_ILLUMINATION,
-    Level: _PLAIN_LEVEL,
-    OptionalNumber: _PLAIN_OPTIONAL,
+    AutoCount: _PLAIN_AUTO_COUNT,
+    OptionalAutoNumber: _PLAIN_OPTIONAL_AUTO_NUMBER,
+    AutoNumber: _PLAIN_AUTO_NUMBER,
+    OptionalNumber: _PLAIN_OPTIONAL_NUMBER,
 }
 
 EPS = math.exp(-5)  # of Eq. 10
-# Parameters that share a learning rate.
+# Groups of parameters, each with one learning rate.
 RATE_GROUPS = (
     "means",
     "heads",
@@ -80,61 +80,76 @@ RATE_GROUPS = (
 class ModelConfig:
     """Shape and initial state of a scene."""
 
-    # What lengths are measured in, and what the extent is that rates of positions scale with: "world" units, and the
-    # radius of the camera path (3DGS); or "depth", a quarter of the median depth of the points, for both.
+    # unit of lengths, and the extent that learning rates of positions scale with. "world": world units, and the radius
+    # of the camera path as in 3DGS; "depth": a quarter of the median depth of the points, for both
     unit: Literal["world", "depth"] = "world"
-    sh_degree: int = 3  # bands k of Eq. 2; (k+1)^2 coefficients
-    plane_size: int = 64  # cells of a spatial axis at the coarsest scale
-    plane_scales: tuple[int, ...] = (1, 2, 4)  # factors on plane_size, concatenated; time is never scaled
-    plane_channels: int = 16  # of the feature that a cell holds
-    box_points: Number = 1.0  # share of the points, along each axis, that the planes' box spans
-    box_rim: float = 0.0  # share of the planes' cells for what lies beyond, contracted; 0: it takes the box's border
-    time_size: int | None = None  # cells of the time axis; None: half the number of training frames
-    time_range: Literal["full", "upper"] = "full"  # "upper": t in [0, 1] read as [-1, 1], half of each time plane
-    aggregation: Literal["paired_sum", "product"] = "paired_sum"  # Eq. 1, or the product of all six planes
-    hidden: int = 128  # width of g, of the heads and of OCD-Net
-    opacity_head: bool = False  # a fourth head moves the opacity's logit, as 4DGS can (arXiv 2310.08528)
-    # How a Gaussian's scales grow with what their head adds; "linear": by a factor of 1 + x instead of exp(x)
+    sh_degree: int = 3  # highest band k of the spherical harmonics (SH) of Eq. 2, which has (k + 1)^2 coefficients
+    plane_size: int = 64  # HexPlane cells along each spatial axis, at the coarsest scale
+    # factors on plane_size, one per scale of the HexPlane; the scales' features are concatenated. Time is not scaled
+    plane_scales: tuple[int, ...] = (1, 2, 4)
+    plane_channels: int = 16  # feature channels of a HexPlane cell
+    box_points: Number = 1.0  # share of the points that the HexPlane's box spans along each axis
+    # share of the HexPlane's cells for the (contracted) space outside its box; 0: points outside take the feature of
+    # the nearest point of the box
+    box_rim: float = 0.0
+    time_size: int | None = None  # HexPlane cells along the time axis; None: half the number of training frames
+    # part of the time axis that is used: "upper" is its upper half, as in the authors' code, where planes are read at t
+    # in [0, 1] as if it lay in [-1, 1]
+    time_range: Literal["full", "upper"] = "full"
+    # how the features of the six planes are combined: "paired_sum" as in Eq. 1, or the "product" of all six
+    aggregation: Literal["paired_sum", "product"] = "paired_sum"
+    hidden: int = 128  # width of the aggregation g (Eq. 1), of the motion heads and of OCD-Net
+    # whether a fourth motion head changes the opacity (before its sigmoid) over time, as 4DGS can (arXiv 2310.08528)
+    opacity_head: bool = False
+    # factor by which an output x > 0 of the scale head enlarges a Gaussian: "exponential", exp(x), or "linear", 1 + x;
+    # x < 0 shrinks it by exp(x) either way
     scale_growth: Literal["exponential", "linear"] = "exponential"
-    motion_gate: bool = False  # a factor a Gaussian in (0, 1) on all that the motion field does to it
-    # With gates: share of the Gaussians that the motion field acts on at once, those whose gates are open widest
+    # whether every Gaussian has a gate: a learned factor in (0, 1) on all that the motion field does to it
+    motion_gate: bool = False
+    # with motion gates: share of the Gaussians that the motion field acts on, those with the widest open gates; in
+    # training they are drawn at random with the odds of their gates
     moving_share: float = 1.0
-    # Whether what moves starts as Gaussians with paths and lifetimes of their own, from tracks of optical flow
-    # (training/seeds.py); the motion field acts on top
+    # whether moving objects start with Gaussians of their own, found by tracking optical flow (training/seeds.py); each
+    # has a path and a lifetime, and the motion field acts on top of these
     tracks: bool = False
-    # Whether points on what stands still are added where flow tells how far away it is (training/surfaces.py)
+    # whether to start with additional points on static surfaces, triangulated from optical flow (training/surfaces.py)
     surfaces: bool = False
-    identity_start: bool = False  # heads and OCD-Net start as "no motion, a_j = 1" instead of at random
-    illumination_offset: Number = 0.5  # l = max(offset + sum a_j b_j B_j, 0)
-    # N(0, 1), U(0, 1), or the frames' colours at the points, with the darkening of model/tone.py undone
+    identity_start: bool = False  # whether motion heads and OCD-Net start with no motion and a_j = 1, not at random
+    illumination_offset: Number = 0.5  # offset in a Gaussian's illumination l = max(offset + sum a_j b_j B_j, 0)
+    # initial reflectances: "normal", N(0, 1); "uniform", U(0, 1); or "observed", the frames' colours at the points,
+    # with the darkening that model/tone.py estimates undone
     reflectance_init: Literal["normal", "uniform", "observed"] = "uniform"
-    # Whether reflectances stay in [0, 1] after every step, those of Gaussians as those of images
-    bounded_reflectance: bool = False
-    attenuation_init: Literal["normal", "uniform"] = "uniform"  # N(0, 1) or U(0, 1)
-    # B1, B2 that BAFE-Net starts at; None: zero bias, 5.5. B1 "auto": what the frames' darkness implies (model/tone.py)
+    bounded_reflectance: bool = False  # whether the Gaussians' reflectances are clipped to [0, 1] after every step
+    attenuation_init: Literal["normal", "uniform"] = "uniform"  # initial b1 and b2 of Eq. 8: N(0, 1) or U(0, 1)
+    # exponents B1 and B2 at the start; None: both 5.5, the middle of their range. "auto" for B1: derived from how dark
+    # the frames are (model/tone.py)
     initial_exponents: Exponents = None
-    # l of every Gaussian at the start; None: luminance of the points. "auto": what makes L^B2 the darkening's gain
-    initial_illumination: Illumination = None
-    # How the frames became dark: "linear-light", by little light; "gain", by a factor on their sRGB values; "auto",
-    # what they look like (model/tone.py); or a number, the exponent that B1 starts at where it is "auto"
+    # illumination l of every Gaussian at the start; None: luminance of its point; "auto": the L for which L^B2 is the
+    # gain of the darkening that model/tone.py estimates
+    initial_illumination: OptionalAutoNumber = None
+    # how the frames became dark: "linear-light", too little light reached the sensor; "gain", their sRGB values were
+    # multiplied by a factor; "auto", recognised from the frames (model/tone.py); or a number, the exponent of sRGB
+    # values that B1 starts at if initial_exponents leaves it to "auto"
     tone: float | Literal["linear-light", "gain", "auto"] = "linear-light"
-    # What Eqs. 7 and 9 speak of: sRGB "values", as in the paper, or the "light" that they stand for, of which a camera
-    # in the dark gets a part; "auto": light if that is what `tone` says
+    # what Eqs. 7 and 9 multiply and raise to powers: sRGB "values", as in the paper, or linear "light"; "auto": light
+    # if the tone is "linear-light"
     domain: Literal["values", "light", "auto"] = "values"
-    relative_light: bool = False  # in Eq. 7, L_w over what it starts from: I_w need not be darker than that
-    initial_opacity: Number = 0.1  # of every Gaussian
-    # Whether every training frame has a gain of its own, learned beside the scene; "auto": if the points say so
+    # whether L_w is divided by initial_illumination in Eq. 7, so that the well-lit image can be as bright as R_w
+    relative_light: bool = False
+    initial_opacity: Number = 0.1  # opacity of every Gaussian at the start
+    # whether the camera's exposure changed: "drifting", every training frame has a learned gain per colour channel;
+    # "steady", it has none; "auto", drifting if the brightness of the points differs between frames
     exposure: Literal["steady", "drifting", "auto"] = "steady"
     background: float = 0.0  # value of L and R where nothing is drawn
-    # "retinex": Eqs. 5-9; "none": colours by spherical harmonics, as 4DGS (arXiv 2310.08528) has them, are both the
-    # low-light and the well-lit image (Table 1, 4DGS); "curve": they are the well-lit image, and a learned tone curve
-    # of it is the low-light one (model/tone_curves.py)
+    # "retinex": illumination and reflectance (Eqs. 5-9); "none": Gaussians have SH colours as in 4DGS (arXiv
+    # 2310.08528), whose image is both the low-light and the well-lit one (Table 1, 4DGS); "curve": the image of the SH
+    # colours is the well-lit one, and a learned tone curve of it the low-light one (model/tone_curves.py)
     decomposition: Literal["retinex", "none", "curve"] = "retinex"
-    ocd: bool = True  # whether OCD-Net lights Gaussians anew at every instant; otherwise a_j = 1 (Table 3, w/o OCD-Net)
-    # Whether B1 and B2 come from BAFE-Net; otherwise from the blended features alone, brought to the same range (Table
-    # 3, w/o BAFE-Net)
+    ocd: bool = True  # whether OCD-Net changes the illumination over time; otherwise a_j = 1 (Table 3, w/o OCD-Net)
+    # whether B1 and B2 come from BAFE-Net; otherwise they are the blended b1 and b2, mapped to the same range (Table 3,
+    # w/o BAFE-Net)
     bafe: bool = True
-    unit_exponent: Literal["b1", "b2"] | None = None  # the exponent that is 1 throughout (Table 3, B1 = 1 and B2 = 1)
+    unit_exponent: Literal["b1", "b2"] | None = None  # the exponent that is fixed at 1 (Table 3, B1 = 1 and B2 = 1)
 
     def __post_init__(self) -> None:
         if not 0 < self.moving_share <= 1:
@@ -143,77 +158,82 @@ class ModelConfig:
 
 @dataclass(frozen=True)
 class LossConfig:
-    """Weights and forms of Eqs. 10-15 and of the plane regularisers."""
+    """Weights and forms of Eqs. 10-15, of the plane regularisers, and of terms that the paper does not have."""
 
-    l1_on: Literal["raw", "tonemapped"] = "raw"  # first term of Eq. 10 on I, or on (I + eps)^eta like the second
+    # images that the L1 term of Eq. 10 compares: "raw", I itself, or "tonemapped", (I + eps)^eta as in the SSIM term
+    l1_on: Literal["raw", "tonemapped"] = "raw"
     ssim: Number = 1.0  # weight of 1 - SSIM in Eq. 10
-    eps: Number = EPS  # of Eq. 10
-    eta_start: Number = 0.95  # exponent of Eq. 10 at the start
-    eta_end: Number = 0.5  # the same at the end
-    eta_restarts: bool = False  # the decay starts anew with the fine stage
-    exposure: Number = 0.01  # lambda_1, Eq. 11
-    # Mean brightness that Eq. 11 asks for, sRGB: the knob for a brighter or darker result. "auto": mid-grey, or what
-    # keeps highlights from clipping (model/tone.py)
-    exposure_level: Level = 0.6
-    exposure_of: Literal["reflectance", "welllit"] = "reflectance"  # the image whose brightness that is
-    exposure_window: int | None = 16  # pixels; None: the mean of the whole image
-    exposure_form: Literal["absolute", "squared"] = "absolute"  # what the difference counts as
-    amplification: Number = 0.05  # lambda_2, Eq. 13
-    # Weight of mean |1 - R_w|, beside Eq. 13 or instead of it (Table 3, L + 0.05 |1 - R_w| and Maximize R_w)
+    eps: Number = EPS  # epsilon of Eq. 10
+    eta_start: Number = 0.95  # exponent eta of Eq. 10 at the start
+    eta_end: Number = 0.5  # exponent eta of Eq. 10 at the end
+    eta_restarts: bool = False  # whether the decay of eta starts again with the fine stage
+    exposure: Number = 0.01  # lambda_1: weight of the exposure loss (Eq. 11)
+    # mean brightness (sRGB) that Eq. 11 asks for: raise or lower it for a brighter or darker result. "auto": mid-grey,
+    # or less where highlights would clip (model/tone.py)
+    exposure_level: AutoNumber = 0.6
+    exposure_of: Literal["reflectance", "welllit"] = "reflectance"  # image whose brightness Eq. 11 controls, R_w or I_w
+    exposure_window: int | None = 16  # side in pixels of the blocks whose means Eq. 11 takes; None: the whole image
+    exposure_form: Literal["absolute", "squared"] = "absolute"  # penalty of Eq. 11 on the difference from the level
+    amplification: Number = 0.05  # lambda_2: weight of mean |1 - L_w| (Eq. 13)
+    # weight of mean |1 - R_w|, in addition to Eq. 13 or instead of it (Table 3, L + 0.05 |1 - R_w| and Maximize R_w)
     reflectance_amplification: Number = 0.0
-    structure: Number = 1.0  # lambda_3, Eq. 14
-    structure_illumination: OptionalNumber = None  # lambda_4, Eq. 14; None: as lambda_3
-    structure_beta: Number = 0.5  # beta_1, Eq. 14
-    structure_beta_illumination: OptionalNumber = None  # beta_2, Eq. 14; None: as beta_1
-    structure_gradient: Literal["components", "magnitude"] = "components"  # forward differences, or sqrt(dx^2 + dy^2)
-    depth: Number = 0.001  # lambda_5, Eq. 12
-    depth_gradient: Literal["forward", "sobel"] = "forward"  # differences in Eq. 12
-    depth_gain: Number = 1.0  # factor on D inside Eq. 12
-    depth_input: Number = 0.0  # difference from the scene's own depth, if it has any (training/given_depth.py)
-    illumination_tv: Number = 0.0  # mean |forward difference| of L_w
-    exponent_prior: Number = 0.0  # mean |B1 - initial B1|
-    plane_smoothness: Number = 2e-4  # second differences along the space planes' first axis, fine stage only
-    time_smoothness: Number = 1e-3  # second differences in t
-    time_l1: Number = 1e-4  # mean |1 - plane| of the time planes
-    opacity: Number = 0.0  # mean opacity
-    scale: Number = 0.0  # mean scale, in the unit of lengths
-    gate: Number = 0.0  # mean factor on motion, fine stage only
-    # With tone curves: how far they are from those that leave well-lit images flat histograms, and from power laws
+    structure: Number = 1.0  # lambda_3: weight of the structure loss (Eq. 14) between B1 and R_w
+    structure_illumination: OptionalNumber = None  # lambda_4: the same between B2 and L_w; None: as lambda_3
+    structure_beta: Number = 0.5  # beta_1 of Eq. 14: factor on B1's gradient
+    structure_beta_illumination: OptionalNumber = None  # beta_2 of Eq. 14: factor on B2's gradient; None: as beta_1
+    # gradients in Eq. 14: forward differences in x and y, or sqrt(dx^2 + dy^2) of central differences
+    structure_gradient: Literal["components", "magnitude"] = "components"
+    depth: Number = 0.001  # lambda_5: weight of the edge-aware smoothness of depth (Eq. 12)
+    depth_gradient: Literal["forward", "sobel"] = "forward"  # gradients in Eq. 12: forward differences or Sobel filters
+    depth_gain: Number = 1.0  # factor on the depth D in Eq. 12
+    depth_input: Number = 0.0  # weight of the difference from the scene's own depth maps (training/given_depth.py)
+    illumination_tv: Number = 0.0  # weight of the total variation of L_w
+    exponent_prior: Number = 0.0  # weight of mean |B1 - initial B1|
+    # weight of squared second differences of the HexPlane's space planes along their first axis; fine stage only
+    plane_smoothness: Number = 2e-4
+    time_smoothness: Number = 1e-3  # weight of squared second differences of the time planes in time; fine stage only
+    time_l1: Number = 1e-4  # weight of mean |1 - plane| of the HexPlane's time planes; fine stage only
+    opacity: Number = 0.0  # weight of the mean opacity
+    scale: Number = 0.0  # weight of the mean scale, in the unit of lengths
+    gate: Number = 0.0  # weight of the mean motion gate; fine stage only
+    # with tone curves: weight of their distance from curves that give well-lit images a flat histogram
     equalisation: Number = 0.0
+    # with tone curves: weight of their distance from power laws
     bend: Number = 0.0
 
 
 @dataclass(frozen=True)
 class OptimConfig:
-    """Adam and its learning rates. `*_lr` of positions, motion field and networks decay exponentially to `*_lr_end`."""
+    """Adam and its learning rates. A rate `*_lr` with a `*_lr_end` decays to it exponentially; others are constant."""
 
-    means_lr: Number = 1.6e-4
-    means_lr_end: Number = 1.6e-6
-    heads_lr: Number = 1.6e-4  # g and the mu, Q, S heads
-    heads_lr_end: Number = 1.6e-5
-    planes_lr: Number = 1.6e-3
-    planes_lr_end: Number = 1.6e-4
-    ocd_lr: Number = 1.6e-4
-    ocd_lr_end: Number = 1.6e-5
-    bafe_lr: Number = 1.6e-3
-    bafe_lr_end: Number = 1.6e-4
-    extent_scales: tuple[str, ...] = ("means", "heads", "planes")  # RATE_GROUPS whose rates the extent multiplies
-    illumination_lr: Number = 2.5e-3
-    illumination_rest_divisor: Number = 20.0  # of illumination_lr, for the higher bands
-    reflectance_lr: Number = 1e-5
-    attenuation_lr: Number = 1e-5
-    opacity_lr: Number = 0.05
-    scales_lr: Number = 5e-3
-    quats_lr: Number = 1e-3
-    gate_lr: Number = 0.01
-    paths_lr: Number = 1e-3
-    lifetimes_lr: Number = 0.0
-    exposures_lr: Number = 1e-3
-    curves_lr: Number = 1e-3
-    decay_steps: Length = 20_000  # length of the decays; None: the length of the stage
-    beta1: Number = 0.9
-    beta2: Number = 0.999
-    eps: Number = 1e-15
+    means_lr: Number = 1.6e-4  # learning rate of the Gaussians' centres
+    means_lr_end: Number = 1.6e-6  # final learning rate of the Gaussians' centres
+    heads_lr: Number = 1.6e-4  # learning rate of the aggregation g and the motion heads (Eq. 1)
+    heads_lr_end: Number = 1.6e-5  # final learning rate of the aggregation g and the motion heads (Eq. 1)
+    planes_lr: Number = 1.6e-3  # learning rate of the HexPlane
+    planes_lr_end: Number = 1.6e-4  # final learning rate of the HexPlane
+    ocd_lr: Number = 1.6e-4  # learning rate of OCD-Net
+    ocd_lr_end: Number = 1.6e-5  # final learning rate of OCD-Net
+    bafe_lr: Number = 1.6e-3  # learning rate of BAFE-Net
+    bafe_lr_end: Number = 1.6e-4  # final learning rate of BAFE-Net
+    # groups of parameters, such as means or paths, whose learning rates are multiplied by the extent (see model.unit)
+    extent_scales: tuple[str, ...] = ("means", "heads", "planes")
+    illumination_lr: Number = 2.5e-3  # learning rate of the constant SH coefficient of the illumination
+    illumination_rest_divisor: Number = 20.0  # illumination_lr divided by this is the rate of the higher SH bands
+    reflectance_lr: Number = 1e-5  # learning rate of the reflectances
+    attenuation_lr: Number = 1e-5  # learning rate of b1 and b2 (Eq. 8)
+    opacity_lr: Number = 0.05  # learning rate of the opacities
+    scales_lr: Number = 5e-3  # learning rate of the scales
+    quats_lr: Number = 1e-3  # learning rate of the rotations
+    gate_lr: Number = 0.01  # learning rate of the motion gates
+    paths_lr: Number = 1e-3  # learning rate of the paths of tracked Gaussians (model.tracks)
+    lifetimes_lr: Number = 0.0  # learning rate of the lifetimes of tracked Gaussians (model.tracks)
+    exposures_lr: Number = 1e-3  # learning rate of the gains of the training frames (model.exposure)
+    curves_lr: Number = 1e-3  # learning rate of the tone curves (model.decomposition)
+    decay_steps: OptionalCount = 20_000  # steps that a decay takes; None: the length of the stage
+    beta1: Number = 0.9  # decay of Adam's first moment
+    beta2: Number = 0.999  # decay of Adam's second moment
+    eps: Number = 1e-15  # added to the root of Adam's second moment
 
     def __post_init__(self) -> None:
         unknown = sorted(set(self.extent_scales) - set(RATE_GROUPS))
@@ -223,24 +243,30 @@ class OptimConfig:
 
 @dataclass(frozen=True)
 class DensityConfig:
-    """How the number of Gaussians follows the image."""
+    """Densification: how Gaussians are added, moved and removed."""
 
-    # "adaptive": clone, split and prune (3D Gaussian Splatting, arXiv 2308.04079, as 4DGS sets it); "mcmc": relocation
-    # and noise in a fixed capacity (arXiv 2404.09591)
+    # "adaptive": clone, split and prune (3D Gaussian Splatting, arXiv 2308.04079, as in 4DGS); "mcmc": relocate faint
+    # Gaussians, add new ones up to max_gaussians, and disturb them by noise (arXiv 2404.09591)
     method: Literal["adaptive", "mcmc"] = "adaptive"
-    start: int = 500  # steps of each stage before it changes
-    stop: int = 10_000  # steps of each stage after which it stays
-    interval: int = 100  # steps between two changes
-    grad_threshold: Number = 2e-4  # mean norm of dL/d(mean2d), normalised device coordinates
-    clone_below: Number = 0.01  # of the extent; larger Gaussians split
-    conserve_opacity: bool = False  # a new pair covers as much as its source did (arXiv 2404.06109)
-    prune_opacity: Number = 0.005  # below it a Gaussian is removed, or moved to where it is needed
-    prune_above: Count = 0  # prune only when more Gaussians than this exist
-    max_gaussians: Most = 360_000  # "auto": 0.6 to 1 a pixel of a frame, no more than that, at least the points
-    noise: Number = 5e5  # "mcmc": on the centres of faint Gaussians, times their learning rate
-    # "mcmc": which Gaussians have copies; "gradient": by opacity times the summed norm of dL/d(mean2d)
+    start: int = 500  # step of each stage after which densification begins
+    stop: int = 10_000  # step of each stage from which on there is no densification
+    interval: int = 100  # steps between two densifications
+    # "adaptive": mean norm of dL/d(mean2d), in normalised device coordinates, from which a Gaussian is cloned or split
+    grad_threshold: Number = 2e-4
+    # "adaptive": scale, relative to the extent, up to which a Gaussian is cloned; larger ones are split
+    clone_below: Number = 0.01
+    # "adaptive": whether a clone or split lowers opacities so that the pair covers what one did (arXiv 2404.06109)
+    conserve_opacity: bool = False
+    prune_opacity: Number = 0.005  # opacity below which a Gaussian is removed ("adaptive") or relocated ("mcmc")
+    prune_above: Count = 0  # "adaptive": remove Gaussians only while there are more than this
+    # largest number of Gaussians, unless the scene starts with more; "auto": 0.6 to 1 per pixel of a frame, at most
+    # 360,000
+    max_gaussians: AutoCount = 360_000
+    noise: Number = 5e5  # "mcmc": strength of the noise on centres of faint Gaussians, as a factor on means_lr
+    # "mcmc": which Gaussians are copied: in proportion to opacity, or with "gradient" to opacity times the summed norm
+    # of dL/d(mean2d)
     drawn_by: Literal["opacity", "gradient"] = "opacity"
-    spread: float = 0.0  # "mcmc": of a Gaussian's copies about it, in its standard deviations
+    spread: float = 0.0  # "mcmc": standard deviation of copies about their source, relative to their scales
 
     def __post_init__(self) -> None:
         if not 0 <= self.spread < 1:
@@ -251,22 +277,24 @@ class DensityConfig:
 class Config:
     """All settings of a training run; saved as `config.json` in its folder."""
 
-    coarse_steps: int = 3000  # of the first stage, in which nothing moves
-    fine_steps: int = 20_000  # of the second, in which things do
-    batch_size: int = 2  # views a step
-    seed: Count = 0  # of all that is random
-    downscale: int = 1  # reads images at 1/downscale of their full size
-    format: Layout = "auto"  # of the scene's folder; "auto": found from its contents
-    held_out: str = "auto"  # views not trained on: the scene's own, "4dgs", or k for every k-th (data/splits.py)
-    sh_warmup: int | None = 1000  # steps between activating one more SH band; None: all by half of the run
-    drop: Number = 0.0  # share of the Gaussians that a step leaves out at random, at the end of the run
+    coarse_steps: int = 3000  # steps of the coarse stage, in which the motion field does not act
+    fine_steps: int = 20_000  # steps of the fine stage, in which the motion field acts
+    batch_size: int = 2  # views per step
+    seed: Count = 0  # seed of everything random
+    downscale: int = 1  # integer factor by which to shrink the images
+    format: Layout = "auto"  # layout of the scene's folder; "auto" recognises it from its contents
+    # views not trained on: "auto" (the scene's own, or else the layout's rule), "4dgs", or a number k for every k-th
+    # frame (docs/data.md)
+    held_out: str = "auto"
+    sh_warmup: int | None = 1000  # steps after which one more SH band is used; None: all are used after half of the run
+    drop: Number = 0.0  # share of the Gaussians that a step leaves out at random; grows from 0 to this over the run
     checkpoint_every: int = 500  # steps between checkpoints
-    keep_checkpoints: int = 2  # how many of the last ones stay, in case that the very last is damaged
-    # Share of the views that lie between two frames of the video, drawn by optical flow (training/inbetweens.py)
+    keep_checkpoints: int = 2  # number of checkpoints to keep, in case the last one is damaged
+    # share of the training views that lie between two frames, synthesised by optical flow (training/inbetweens.py)
     inbetweens: float = 0.0
-    # How the frames are brightened before training, where low light is not modelled (preprocess/enhancement.py)
+    # how the frames are brightened before training, for a model of well-lit frames (preprocess/enhancement.py)
     enhance: Enhancement = "none"
-    frame_memory: float = 4.0  # GiB that a scene's frames may take; beyond it they lie in temporary files
+    frame_memory: float = 4.0  # GiB of memory for the scene's frames; if they take more, they go to temporary files
     model: ModelConfig = field(default_factory=ModelConfig)
     loss: LossConfig = field(default_factory=LossConfig)
     optim: OptimConfig = field(default_factory=OptimConfig)
@@ -278,15 +306,14 @@ class Config:
         return self.coarse_steps + self.fine_steps
 
     def stage_of(self, step: int) -> str:
-        """The stage that the step of that number, from 1, belongs to."""
+        """The stage that a step belongs to; steps are numbered from 1."""
         return "coarse" if step <= self.coarse_steps else "fine"
 
     def check_counts(self) -> None:
-        """Complain of numbers that make no training.
+        """Check the numbers of steps, of views per step, and of checkpoints.
 
         Raises:
-            UserError: a number of steps is negative, or both are zero; a step has no views; no number of steps lies
-                between checkpoints; or none is kept.
+            UserError: a number of steps is negative or both are zero, or one of the other numbers is below 1.
         """
         for name, count in (
             ("--batch-size", self.batch_size),
@@ -299,7 +326,7 @@ class Config:
             raise UserError("--coarse-steps and --fine-steps: expected no negative number and at least one step in all")
 
 
-# Settings of how a run is carried out, not of what it computes: they may change when it goes on.
+# Settings of how a run is carried out, not of what it computes: they may change when it is resumed.
 EXECUTION = frozenset({"checkpoint_every", "frame_memory", "keep_checkpoints"})
 
 
@@ -319,5 +346,5 @@ def from_dict(values: dict) -> Config:
 
 
 def _with_tuples(values: dict[str, Any]) -> dict[str, Any]:
-    """Tuples again where JSON has made lists of them."""
+    """Turn lists back into the tuples that JSON made them of."""
     return {key: tuple(v) if isinstance(v, list) else v for key, v in values.items()}

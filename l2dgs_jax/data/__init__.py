@@ -1,4 +1,4 @@
-"""Scenes on disk to arrays in memory, and back."""
+"""Reading scenes from disk into arrays, and writing them."""
 
 import dataclasses
 import zipfile
@@ -25,14 +25,14 @@ def load_dataset(
     held_out: str = "auto",
     frame_memory: float = Config.frame_memory,
 ) -> Dataset:
-    """Read a scene, whichever of the known layouts it has.
+    """Read a scene in any of the known layouts.
 
     Args:
         scene: its folder, or "demo" for the clip that comes with the package.
-        downscale: whole factor by which images are smaller than full size.
-        format: a name in `LAYOUTS`, or "auto" for the one that the folder has.
+        downscale: integer factor by which images are smaller than full size.
+        format: a name in `LAYOUTS`, or "auto" to recognise the layout of the folder.
         held_out: which frames are not trained on, see `splits.hold_out`.
-        frame_memory: GiB that its frames may take; if they take more they lie in temporary files (`MappedArray`).
+        frame_memory: GiB of memory for its frames; if they take more, they go to temporary files (`MappedArray`).
 
     Raises:
         UserError: anything in the scene is missing, malformed or inconsistent.
@@ -54,7 +54,7 @@ def load_dataset(
             raise UserError(f"{folder}: no such folder; expected a scene's folder, or 'demo'")
         if format == "auto":
             format = _recognized(folder)
-        with np.errstate(all="ignore"):  # `assemble` complains of what has overflown
+        with np.errstate(all="ignore"):  # `assemble` rejects values that have overflowed
             dataset = LAYOUTS[format].read(folder, downscale, held_out, frame_memory)
     except OSError as error:
         raise UserError(f"{error.filename or folder}: {error.strerror}; expected files that can be read") from None

@@ -1,4 +1,4 @@
-"""From frames as a reader describes them to the data set in memory."""
+"""From the frames that a reader describes to the data set in memory."""
 
 import os
 from collections.abc import Iterator, Sequence
@@ -19,10 +19,10 @@ from l2dgs_jax.errors import UserError
 from l2dgs_jax.runtime.prefetch import prefetch
 from l2dgs_jax.types import Camera
 
-OPPOSED = -0.3  # correlation of depth and points from which on one of them is upside down
+INVERTED_BELOW = -0.3  # correlation of given depth and depth of the points: below it, the given one is inverse depth
 LINEAR_NOTE = "pictures of floating-point values are taken as linear light and converted to sRGB"
 
-# Decoding and resampling release the interpreter lock.
+# Threads help because decoding and resampling release Python's global interpreter lock.
 _parallel = partial(prefetch, workers=min(os.cpu_count() or 1, 8))
 
 
@@ -32,15 +32,15 @@ class Frame:
 
     Attributes:
         name: of the frame.
-        source: what describes its camera, for messages.
-        viewmat: world to camera, rigid.
+        source: the file, or part of it, that describes its camera, for messages.
+        viewmat: rigid world-to-camera matrix.
         K: intrinsics in pixels of the full size.
         lens: its distortion.
         size: full width and height in pixels.
         time: instant in [0, 1].
         image: the low-light picture.
-        alpha: what its alpha means: which pixels count, or how much of each the scene covers before a black
-            background.
+        alpha: meaning of its alpha channel: which pixels count ("validity"), or how much of each pixel the scene covers
+            in front of a black background ("coverage").
     """
 
     name: str
@@ -66,8 +66,8 @@ def assemble(
 ) -> Dataset:
     """Read the pictures of the frames, undistorted and `downscale` times smaller than the cameras' full size.
 
-    Whatever the layout, `well/<k>x/<name>.png`, `mask/<k>x/<name>.png` and `covisible/<k>x/{train,val}/<name>.png` in
-    the scene's folder are the frames' truth and masks, and `depth/` or `disparity/` (depth_maps.py) is their depth.
+    In every layout, `well/<k>x/<name>.png`, `mask/<k>x/<name>.png` and `covisible/<k>x/{train,val}/<name>.png` in the
+    scene's folder are the frames' ground truth and masks, and `depth/` or `disparity/` (depth_maps.py) their depth.
 
     Args:
         folder: of the scene.
@@ -75,13 +75,13 @@ def assemble(
         test: held-out frames.
         points: surface points, world units.
         colors: of the points, in [0, 1].
-        downscale: every picture's own scale divides it.
-        frame_memory: GiB that pictures, truth and depth may take together; beyond it they lie in temporary files.
-        notes: what the reader assumed.
+        downscale: a multiple of every picture's own scale.
+        frame_memory: GiB for pictures, ground truth and depth together; if they take more, they go to temporary files.
+        notes: assumptions of the reader.
 
     Raises:
         UserError: a picture is missing, damaged, or of another size than its camera or the other pictures; or a camera
-            or point lies beyond what single precision can hold; or depth and points contradict each other; or there is
+            or point has values too large for single precision; or depth and points contradict each other; or there is
             no room for the temporary files.
     """
     frames = [*train, *test]
@@ -91,14 +91,14 @@ def assemble(
     if _check_pictures([frame.image for frame in frames], full):
         notes = (*notes, LINEAR_NOTE)
     width, height = full[0] // downscale, full[1] // downscale
-    # Of a pixel; masks take a sixth of what pictures take.
+    # Bytes per pixel; masks, which take a sixth of what pictures take, are not counted.
     size = 6 * (1 + (folder / "well").is_dir()) + 4 * any((folder / kind).is_dir() for kind in depth_maps.FOLDERS)
     in_file = size * len(frames) * height * width > frame_memory * 2**30
     learned, train_notes = _SplitReader(folder, "train", train, width, height, downscale, in_file).read()
-    if learned.depths is not None and depth_maps.agreement(learned.depths, learned.cameras, points) < OPPOSED:
+    if learned.depths is not None and depth_maps.agreement(learned.depths, learned.cameras, points) < INVERTED_BELOW:
         raise UserError(
-            f"{folder}: its depth falls where its points are farther away; expected distances in depth/, or their "
-            "inverses in disparity/"
+            f"{folder}: its depth falls where its points are farther away; expected distances in depth/, and inverse "
+            "distances in disparity/"
         )
     held_out, test_notes = _SplitReader(folder, "val", test, width, height, downscale, in_file).read()
     return Dataset(
@@ -124,7 +124,7 @@ def _common_size(frames: Sequence[Frame]) -> tuple[int, int]:
 
 
 def _check_pictures(pictures: Sequence[Picture], full: tuple[int, int]) -> bool:
-    """Compare every picture's header with the cameras' full size; whether any picture holds linear light."""
+    """Check every picture's size against the cameras' full size; returns whether any picture holds linear light."""
     headers = list(_parallel(lambda picture: images.read_header(picture.path), pictures))
     for picture, header in zip(pictures, headers, strict=True):
         _check_size(picture, header.size, full, " once turned as its EXIF orientation says" if header.turned else "")
@@ -142,15 +142,15 @@ def _check_size(picture: Picture, size: tuple[int, int], full: tuple[int, int], 
 
 @dataclass(frozen=True)
 class _SplitReader:
-    """Reads what lies on disk of the frames of one split, undistorted and of one size.
+    """Reads everything on disk that belongs to the frames of one split, undistorted and at one size.
 
     Attributes:
         folder: of the scene.
         part: "train" or "val".
         frames: of the split.
         width: of the images to return, pixels.
-        height: likewise.
-        downscale: factor on the full size.
+        height: of the images to return, pixels.
+        downscale: factor by which they are smaller than full size.
         in_file: whether stacks of frames go to temporary files.
     """
 
@@ -163,7 +163,7 @@ class _SplitReader:
     in_file: bool
 
     def read(self) -> tuple[Split, list[str]]:
-        """The split, with notes; truth, masks and depth that no frame has are None."""
+        """The split, and notes; ground truth, masks and depth are None if they are missing."""
         lowlight, valid = self._lowlight()
         welllit, well_note = self._truth("well", as_mask=False)
         masks, mask_note = self._truth("mask", as_mask=True)
@@ -190,7 +190,7 @@ class _SplitReader:
 
     def _lowlight(self) -> tuple[Float16[np.ndarray, "F H W 3"], Bool[np.ndarray, "F H W"] | None]:
         """The low-light images, and which of their pixels count; None if all do."""
-        # Few frames have pixels that do not count, and only theirs are kept, as bits, until all are known.
+        # Until all frames are read, masks are kept as bits, and only for frames with pixels that do not count.
         partly: dict[int, UInt8[np.ndarray, " B"]] = {}
 
         def read_one(index: int) -> Float16[np.ndarray, "H W 3"]:
@@ -216,7 +216,7 @@ class _SplitReader:
         else:
             image, alpha = images.read_image_and_alpha(frame.image.path)
         counts = np.ones((self.height, self.width), bool)
-        # A pixel counts if all that it was made from does.
+        # A pixel counts if everything that it was interpolated from does.
         inside = seen((image.shape[1], image.shape[0]), scale_intrinsics(frame.K, scale), frame.lens)
         if inside is not None:
             counts = counts & (self._shrink(inside[..., None].astype(np.float32), scale)[..., 0] > 0.999)
@@ -225,7 +225,7 @@ class _SplitReader:
         return self._fit(frame, image, scale).astype(np.float16), counts
 
     def _truth(self, kind: str, as_mask: bool, prefix: str = "") -> tuple[Any, str]:
-        """What lies in a folder beside the layout's own, as images or as masks, and a note if it cannot be used."""
+        """The pictures in a folder such as `well/`, as images or as masks, and a note if they cannot be used."""
         names = [prefix + frame.name for frame in self.frames]
         found, note = stored_if_any(self.folder / kind, self.downscale, names, all_or_none=not as_mask)
         if not found:
@@ -241,7 +241,7 @@ class _SplitReader:
         return self._stack(read_all, bool) if as_mask else self._stack(read_all, np.float16, 3), note
 
     def _depths(self) -> tuple[Float32[np.ndarray, "F H W"] | None, list[str]]:
-        """Depth of the frames, 0 where unknown, and notes."""
+        """Depth of the frames, 0 where unknown (None if no frame has any), and notes."""
         found, inverse, notes = depth_maps.find(self.folder, self.downscale, [frame.name for frame in self.frames])
         if not found:
             return None, notes
@@ -249,7 +249,7 @@ class _SplitReader:
         return self._stack(read_all, np.float32), notes
 
     def _depth(self, frame: Frame, file: Picture | None, inverse: bool) -> Float32[np.ndarray, "H W"]:
-        """Depth of a frame: the inverse of the mean inverse depth of the samples that a pixel is made from."""
+        """Depth of a frame; a pixel has the inverse of the mean inverse depth of the known samples that it covers."""
         if file is None:
             return np.zeros((self.height, self.width), np.float32)
         disparity = depth_maps.read(file.path, inverse)
@@ -262,7 +262,7 @@ class _SplitReader:
         return np.divide(share, total, out=np.zeros_like(share), where=share > 0)
 
     def _fit(self, frame: Frame, image: Float32[np.ndarray, "h w C"], scale: int) -> Float32[np.ndarray, "H W C"]:
-        """A picture that is already `scale` times smaller, undistorted, at the size wanted."""
+        """A picture that is already `scale` times smaller, undistorted and shrunk to the final size."""
         return self._shrink(undistort(image, scale_intrinsics(frame.K, scale), frame.lens), scale)
 
     def _shrink(self, image: Float32[np.ndarray, "h w C"], scale: int) -> Float32[np.ndarray, "H W C"]:
@@ -278,7 +278,7 @@ def _singles(values: Sequence[np.ndarray], frames: Sequence[Frame]) -> Any:
 
 
 def _single(values: Float[np.ndarray, "*S"], what: str) -> Float32[np.ndarray, "*S"]:
-    if not (np.abs(values) < 1e18).all():  # squares must fit as well
+    if not (np.abs(values) < 1e18).all():  # their squares must fit into single precision too
         raise UserError(f"{what} holds values beyond 1e18 or not finite; expected a scene of moderate size")
     return values.astype(np.float32)
 

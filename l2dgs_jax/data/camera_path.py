@@ -5,7 +5,7 @@
     camera_path                     for each camera: camera_to_world (16 numbers, row by row; axes right, up, back),
                                     fov (vertical, degrees) and [render_time] or [time] in [0, 1]
 
-All else is for the viewer alone.
+Fields in brackets are optional; all others are for nerfstudio's viewer only and ignored.
 """
 
 from pathlib import Path
@@ -23,12 +23,12 @@ _TIMES = ("render_time", "time")
 
 
 class CameraPath(NamedTuple):
-    """Cameras of a file, and what it says of the images to render.
+    """Cameras of a file, and the size and frame rate of the images to render.
 
     Attributes:
         cameras: NumPy float32 arrays; time runs evenly from 0 to 1 if the file does not say it.
         size: width and height of the images that `K` is for, pixels.
-        fps: frames a second, if the file says it.
+        fps: frames per second, if the file says it.
     """
 
     cameras: Camera
@@ -37,14 +37,14 @@ class CameraPath(NamedTuple):
 
 
 def read_camera_path(path: Path, size: tuple[int, int]) -> CameraPath:
-    """Read a path in the coordinates of the scene's cameras.
+    """Read a camera path, which must be in the coordinates of the scene's cameras.
 
     Args:
         path: the file.
         size: width and height of the images if the file does not say it, pixels.
 
     Raises:
-        UserError: the file is missing or malformed, or has no cameras, or others than perspective ones.
+        UserError: the file is missing or malformed, or has no cameras or other than perspective ones.
     """
     content = read_json(path, "nerfstudio's camera path")
     kind = content.get("camera_type", "perspective")

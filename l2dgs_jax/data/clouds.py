@@ -1,4 +1,4 @@
-"""Where a scene's surfaces may be when its layout has no list of points: files beside it, else seeded noise."""
+"""Initial points for scenes whose layout has none: from a PLY file beside them, or else random."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,10 +9,10 @@ from jaxtyping import Float, Float32, Float64, Shaped
 from l2dgs_jax.cameras.geometry import camera_centres
 from l2dgs_jax.errors import UserError
 
-COUNT = 10_000  # points of a random cloud
-FILES = ("points3D.ply", "points3d.ply", "sparse_pc.ply")
-# Half the side of the box over the cameras' distance from its centre: 1.3 over 4, as users of D-NeRF have it.
-BOX = 0.325
+RANDOM_POINTS = 10_000  # in a random cloud
+CLOUD_FILES = ("points3D.ply", "points3d.ply", "sparse_pc.ply")
+# Half the side of the box of random points, over the cameras' distance from its centre: 1.3 / 4, as usual for D-NeRF.
+BOX_OVER_DISTANCE = 0.325
 
 Cloud = tuple[Float[np.ndarray, "P 3"], Float32[np.ndarray, "P 3"] | None]
 
@@ -23,12 +23,12 @@ _ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 
 def find(folder: Path, named: str | None = None) -> Cloud | None:
-    """The cloud in a PLY file of the scene: the one it names, else one of `FILES`.
+    """The cloud in a PLY file of the scene: the one that it names, or else one of `CLOUD_FILES`, if there is one.
 
     Raises:
         UserError: the file is missing or damaged.
     """
-    for path in (folder / named,) if named else (folder / name for name in FILES):
+    for path in (folder / named,) if named else (folder / name for name in CLOUD_FILES):
         if named or path.is_file():
             return read_ply(path)
     return None
@@ -38,17 +38,19 @@ def in_common_box(viewmats: Float64[np.ndarray, "F 4 4"], source: str) -> Float6
     """Random points in a box around the place that all cameras look at.
 
     Raises:
-        UserError: they look at no common place.
+        UserError: the cameras look at no common place.
     """
     centres = camera_centres(viewmats)
     axes = viewmats[:, 2, :3]
-    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # onto the plane that an axis is normal to
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # projections onto the planes normal to the axes
     total = across.sum(0)
     if not np.linalg.cond(total) < 1e4:
-        raise UserError(f"{source}: the cameras look at no common place; expected a point cloud such as {FILES[0]}")
+        raise UserError(
+            f"{source}: the cameras look at no common place; expected a point cloud such as {CLOUD_FILES[0]}"
+        )
     centre = np.linalg.solve(total, np.einsum("fij,fj->i", across, centres))
-    half = BOX * np.median(np.linalg.norm(centres - centre, axis=-1))
-    return centre + half * np.random.default_rng(0).uniform(-1, 1, (COUNT, 3))
+    half = BOX_OVER_DISTANCE * np.median(np.linalg.norm(centres - centre, axis=-1))
+    return centre + half * np.random.default_rng(0).uniform(-1, 1, (RANDOM_POINTS, 3))
 
 
 def in_frusta(
@@ -57,12 +59,12 @@ def in_frusta(
     size: tuple[int, int],
     bounds: Float64[np.ndarray, "F 2"],
 ) -> Float64[np.ndarray, "P 3"]:
-    """Random points that each lie in some camera's view, between its nearest and its farthest depth."""
+    """Random points, each in the view of some camera between that camera's nearest and farthest depth."""
     rng = np.random.default_rng(0)
-    frames = rng.integers(0, len(viewmats), COUNT)
-    pixels = np.concatenate([rng.uniform(0, size, (COUNT, 2)), np.ones((COUNT, 1))], -1)
+    frames = rng.integers(0, len(viewmats), RANDOM_POINTS)
+    pixels = np.concatenate([rng.uniform(0, size, (RANDOM_POINTS, 2)), np.ones((RANDOM_POINTS, 1))], -1)
     near, far = bounds[frames].T
-    depth = near + (far - near) * rng.random(COUNT)
+    depth = near + (far - near) * rng.random(RANDOM_POINTS)
     local = np.einsum("pij,pj->pi", np.linalg.inv(Ks)[frames], pixels) * depth[:, None]
     worlds = np.linalg.inv(viewmats)[frames]
     return np.einsum("pij,pj->pi", worlds[:, :3, :3], local) + worlds[:, :3, 3]
@@ -103,7 +105,7 @@ def write_ply(path: Path, points: Float[np.ndarray, "P 3"], colors: Float[np.nda
 def colored_points(
     points: Float[np.ndarray, "P 3"], colors: Float[np.ndarray, "P 3"] | None
 ) -> Shaped[np.ndarray, " P"]:
-    """The rows of a PLY file of points in single precision and 8-bit colours."""
+    """The rows of a PLY file of points, with positions in single precision and 8-bit colours."""
     kind = [(axis, "<f4") for axis in "xyz"] + [(name, "u1") for name in ("red", "green", "blue") if colors is not None]
     rows = np.empty(len(points), kind)
     for i, axis in enumerate("xyz"):
@@ -127,7 +129,7 @@ def _vertices(lines: Sequence[Sequence[str]], body: bytes) -> Shaped[np.ndarray,
     """The rows of the first element, which must be the vertices.
 
     Raises:
-        ValueError, KeyError, IndexError, TypeError: the header is not as it should be, or the body too short.
+        ValueError, KeyError, IndexError, TypeError: the header is malformed, or the body too short.
     """
     if not lines or lines[0] != ["ply"]:
         raise ValueError("it does not begin with 'ply'")

@@ -2,9 +2,9 @@
 
     sparse/0/{cameras,images,points3D}.{bin,txt}, or the same in sparse/
     images/<name>, or the pictures in another folder or beside sparse/   [images_<k>/<name>, k times smaller]
-    [dataset.json]   [metadata.json]   as Nerfies has them: held-out frames and instants
+    [dataset.json]   [metadata.json]   as in the layout of Nerfies: held-out frames and instants
 
-Alpha 0 marks pixels that do not count.
+Brackets mark what is optional. Alpha 0 marks pixels that do not count.
 """
 
 from pathlib import Path
@@ -29,11 +29,11 @@ def recognizes(folder: Path) -> bool:
 
 
 def read(folder: Path, downscale: int, held_out: str, frame_memory: float) -> Dataset:
-    """Read a scene; its world is the model's.
+    """Read a scene; its world coordinates are the model's.
 
     Args:
         folder: of the scene.
-        downscale: factor on the full size of the images.
+        downscale: integer factor by which images are smaller than full size.
         held_out: see `splits.hold_out`; without lists every eighth frame is held out.
         frame_memory: see `assemble`.
 
@@ -48,7 +48,7 @@ def read(folder: Path, downscale: int, held_out: str, frame_memory: float) -> Da
 
     by_stem = {Path(image.name).with_suffix("").as_posix() if image.name else "": image for image in images}
     if len(by_stem) < len(images):
-        raise UserError(f"{model}: images of one name but different suffixes; expected names that differ before it")
+        raise UserError(f"{model}: lists images that differ only in their suffix; expected names that differ before it")
     names = list(by_stem)
     train, test, notes = splits.hold_out(str(model), names, splits.lists_beside(folder, names), held_out, default="8")
     times = splits.instants(folder, names)
@@ -76,7 +76,7 @@ def read(folder: Path, downscale: int, held_out: str, frame_memory: float) -> Da
 
 
 def write(dataset: Dataset, folder: Path) -> None:
-    """Write a scene so that `read` gives it back, but for single precision in its rotations; pictures get 8 bits.
+    """Write a scene so that `read` gives it back, except that rotations are rounded and pictures get 8 bits.
 
     Raises:
         UserError: the folder holds files already or cannot be written.
@@ -105,13 +105,13 @@ def pinhole_and_lens(camera: ModelCamera) -> tuple[Float64[np.ndarray, "3 3"], L
             lens = Lens((k1, k2), tangential=(p1, p2))
         case "FULL_OPENCV", (k1, k2, p1, p2, k3, *divisor):
             lens = Lens((k1, k2, k3), tuple(divisor), (p1, p2))
-        case _:  # the others have radial terms only, in order
+        case _:  # the other models have radial terms only, in this order
             lens = Lens(tuple(rest), fisheye=camera.model.endswith("FISHEYE"))
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), lens
 
 
 def _root(folder: Path, names: list[str]) -> Path:
-    """The folder that the images' names are relative to: `images` or another that holds the first one."""
+    """The folder that the images' names are relative to: `images`, or another one that holds the first image."""
     usual = folder / "images"
     for candidate in (usual, folder, *sorted(path for path in folder.iterdir() if path.is_dir())):
         if candidate.is_dir() and names[0] in by_name(candidate):

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from l2dgs_jax.errors import UserError
 
-# COLMAP's number of each camera model, and how many parameters it has.
+# COLMAP's number of each camera model, and its number of parameters.
 MODELS = {
     "SIMPLE_PINHOLE": (0, 3),
     "PINHOLE": (1, 4),
@@ -41,7 +41,7 @@ class ModelImage(NamedTuple):
 
     Attributes:
         name: its file, relative to the folder of images.
-        viewmat: world to camera, OpenCV axes.
+        viewmat: rigid world-to-camera matrix, OpenCV axes.
         camera: identifier of its camera.
     """
 
@@ -77,7 +77,7 @@ def read_images(folder: Path) -> list[ModelImage]:
     """The registered images, sorted by name.
 
     Raises:
-        UserError: their file is missing or damaged, or a pose is none.
+        UserError: their file is missing or damaged, or a pose is not a unit quaternion and a translation.
     """
     path = _file(folder, "images")
     images = []
@@ -92,7 +92,7 @@ def read_images(folder: Path) -> list[ModelImage]:
 
 
 def read_points(folder: Path) -> tuple[Float64[np.ndarray, "P 3"], Float32[np.ndarray, "P 3"] | None]:
-    """The model's points and their sRGB colours in [0, 1]; None if all are black, as COLMAP leaves them uncoloured.
+    """The model's points and their sRGB colours in [0, 1]; None if all are black, as COLMAP leaves uncoloured points.
 
     Raises:
         UserError: their file is missing or damaged, or holds none.
@@ -114,7 +114,7 @@ def write_model(
     points: Float[np.ndarray, "P 3"],
     colors: Float[np.ndarray, "P 3"] | None,
 ) -> None:
-    """Write a binary model without the observations of the points; cameras are numbered from 1."""
+    """Write a binary model, without the images' observations of the points; cameras are numbered from 1."""
     folder.mkdir(parents=True)
     with open(folder / "cameras.bin", "wb") as file:
         file.write(struct.pack("<Q", len(cameras)))
@@ -252,7 +252,7 @@ def _lines(path: Path, keep_empty: bool = False) -> list[str]:
 
 
 def _parsed(path: Path, line: str, words: Sequence[str], kinds: Sequence[type]) -> list[Any]:
-    """The words as numbers of these kinds, the last one for all that follow."""
+    """The words converted to numbers of these types; the last type is also that of all further words."""
     kinds = [*kinds[:-1], *[kinds[-1]] * (len(words) - len(kinds) + 1)]
     try:
         return [kind(word) for kind, word in zip(kinds, words, strict=True)]

@@ -1,4 +1,4 @@
-"""The sRGB transfer function and its inverse, of NumPy's and jax's arrays."""
+"""The sRGB transfer function and its inverse, for NumPy and jax arrays."""
 
 from typing import TypeVar
 
@@ -9,13 +9,13 @@ AnyArray = TypeVar("AnyArray", Array, np.ndarray)
 
 
 def srgb_to_linear(value: AnyArray) -> AnyArray:
-    """Inverse of the sRGB transfer function (IEC 61966-2-1), of values [*S] in [0, 1]."""
+    """Inverse of the sRGB transfer function (IEC 61966-2-1), for values [*S] in [0, 1]."""
     where = value.__array_namespace__().where
     return where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
 
 
 def linear_to_srgb(value: AnyArray) -> AnyArray:
-    """The sRGB transfer function (IEC 61966-2-1), of values [*S] >= 0."""
+    """The sRGB transfer function (IEC 61966-2-1), for values [*S] >= 0."""
     where = value.__array_namespace__().where
-    low = value <= 0.0031308  # where the power has no gradient that is finite
+    low = value <= 0.0031308  # includes 0, where the gradient of the power is not finite
     return where(low, value * 12.92, 1.055 * where(low, 1, value) ** (1 / 2.4) - 0.055)

@@ -1,4 +1,4 @@
-"""The one type that every reader returns."""
+"""The data set that every reader returns."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,15 +14,15 @@ from l2dgs_jax.types import Camera
 
 
 class Source(NamedTuple):
-    """What `load_dataset` was asked for, and what became of it; `Config` has settings of the same names.
+    """The arguments of `load_dataset`, and later changes of the frames; `Config` has settings of the same names.
 
     Attributes:
         scene: absolute path of its folder, or "demo".
-        downscale: see `load_dataset`, as the others.
-        format: likewise.
-        held_out: likewise.
-        frame_memory: likewise.
-        enhance: how the training frames were brightened since (preprocess/enhancement.py).
+        downscale: see `load_dataset`.
+        format: see `load_dataset`.
+        held_out: see `load_dataset`.
+        frame_memory: see `load_dataset`.
+        enhance: how the training frames were brightened after loading (preprocess/enhancement.py).
     """
 
     scene: str
@@ -54,19 +54,19 @@ class Original(NamedTuple):
 
 @dataclass(frozen=True)
 class Split:
-    """Frames of a scene as NumPy arrays; images, truth, masks and depths beyond a budget of memory are `MappedArray`s.
+    """Frames of a scene as NumPy arrays; if they exceed a memory budget, stacks of frames are `MappedArray`s.
 
     Attributes:
         names: of the frames.
-        cameras: stacked float32 arrays; K is that of the stored images and has no skew, the images no distortion.
-        images: low-light sRGB values in [0, 1]. Half floats keep what averaging dark 8-bit pixels gains in precision.
+        cameras: stacked float32 arrays; K is that of the images below, which have no distortion, and has no skew.
+        images: low-light sRGB values in [0, 1]. Half floats keep the precision that averaging dark 8-bit pixels gains.
         welllit: the same views at normal exposure, sRGB values in [0, 1], if the scene has them.
         masks: True where something moves, if the scene has them.
-        valid: False where a picture shows nothing to learn from or to be scored on; None where all pixels do.
-        covisible: True where enough training views see the same place, if the scene says so (arXiv 2210.13445).
+        valid: False for pixels that are neither learned from nor scored; None if all pixels count.
+        covisible: True where enough training views see the same place, if the scene has it (arXiv 2210.13445).
         depths: along the optical axis, 0 where unknown, if the scene has them. Only differences of inverse depth within
-            a frame count, and these only up to a factor: where a network guessed them, no more is known.
-        originals: what lies on disk at full size, for those who write pictures that belong to it.
+            a frame count, up to an unknown factor: networks that estimate depth tell no more.
+        originals: the full-size pictures on disk, for code that writes matching ones.
     """
 
     names: tuple[str, ...]
@@ -91,7 +91,7 @@ class Split:
 
 @dataclass(frozen=True)
 class Dataset:
-    """A scene as the package sees it, whatever layout its files have.
+    """A scene, independent of the layout of its files.
 
     Attributes:
         name: for messages.
@@ -101,8 +101,8 @@ class Dataset:
         test: held-out frames.
         points: where the scene has surfaces, world units.
         colors: sRGB values in [0, 1] of the points, if known.
-        notes: sentences on what the reader assumed because the files do not say it.
-        source: where it was read from; None if it was made otherwise.
+        notes: assumptions that the reader made where the files say nothing, as sentences.
+        source: where it was read from; None if it was not read from files.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""The clip that comes with the package; `shelf/README.md` says where it is from."""
+"""The demo clip that comes with the package; `shelf/README.md` names its source."""
 
 from pathlib import Path
 

@@ -1,10 +1,10 @@
-"""Depth that a user has: measured, or what a network makes of single pictures.
+"""Depth maps that come with a scene: measured, or estimated by a network from single pictures.
 
     depth/<k>x/<name>.npy       distances along the optical axis, in any unit
     disparity/<k>x/<name>.npy   their inverses, up to any scale and shift, as MiDaS gives them (arXiv 1907.01341)
 
-Arrays are [H W] or [H W 1]; PNG files, of 16 bits, serve as well. Values that are not finite or not positive are
-unknown. Where there are both, `depth/` counts.
+Arrays are [H W] or [H W 1]; 16-bit PNG files can be used instead. Values that are not finite or not positive mean
+unknown. If both folders exist, `depth/` is used.
 """
 
 from collections.abc import Sequence
@@ -20,20 +20,20 @@ from l2dgs_jax.data.pictures import Picture, by_name, only, scales
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.types import Camera
 
-FOLDERS = {"depth": False, "disparity": True}  # whether what they hold is inverse depth
+FOLDERS = {"depth": False, "disparity": True}  # whether they hold inverse depth
 SUFFIXES = (".npy", ".png")
-LARGEST = 1e18  # squares must fit into single precision as well
-LOOKED_AT = 8  # frames that `agreement` samples
+LARGEST_DEPTH = 1e18  # its square must fit into single precision too
+SAMPLED_FRAMES = 8  # by `agreement`
 
 
 def find(folder: Path, downscale: int, names: Sequence[str]) -> tuple[list[Picture | None], bool, list[str]]:
-    """Each frame's map for the largest k that divides `downscale`, whether they are of inverse depth, and notes.
+    """Each frame's map for the largest k that divides `downscale`, whether these hold inverse depth, and notes.
 
-    An empty list if no frame has one.
-    Some may be without: DyCheck's depth is of the camera that is trained on.
+    Frames without a map have None, because DyCheck has depth of the training camera only; if no frame has a map, the
+    list is empty.
 
     Raises:
-        UserError: a frame has two.
+        UserError: a frame has two maps.
     """
     notes = []
     for kind, inverse in FOLDERS.items():
@@ -68,19 +68,19 @@ def read(path: Path, inverse: bool) -> Float32[np.ndarray, "h w"]:
         if values.ndim not in (2, 3) or values.shape[2:] not in ((), (1,)):
             raise UserError(f"{path}: the array has shape {values.shape}; expected (H, W) or (H, W, 1)")
         values = values.reshape(values.shape[:2]).astype(np.float64)
-    known = (values > 1 / LARGEST) & (values < LARGEST)
+    known = (values > 1 / LARGEST_DEPTH) & (values < LARGEST_DEPTH)
     values = np.where(known, values, 1)
     return np.where(known, values if inverse else 1 / values, 0).astype(np.float32)
 
 
 def agreement(depths: Float32[np.ndarray, "F H W"], cameras: Camera, points: Float[np.ndarray, "P 3"]) -> float:
-    """Correlation of depth with that of the points, logarithms of both, in the median of some frames.
+    """Correlation of the logarithms of given depth and of the points' depth: the median over some frames.
 
-    0 where there is nothing to compare. It tells depth from inverse depth, which are easily mistaken for each other.
+    0 if there is nothing to compare. It is negative where inverse depth was given by mistake.
     """
     height, width = depths.shape[1:]
     found = []
-    for frame in range(0, len(depths), -(-len(depths) // LOOKED_AT)):
+    for frame in range(0, len(depths), -(-len(depths) // SAMPLED_FRAMES)):
         depth = depths[frame]
         viewmat, K = (np.asarray(x[frame]) for x in (cameras.viewmat, cameras.K))
         _, pixels, distances = points_inside(points, viewmat, K, (width, height))

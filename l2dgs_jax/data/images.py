@@ -18,7 +18,7 @@ SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".exr", ".hdr", "
 
 
 class Header(NamedTuple):
-    """What a picture file says before its pixels.
+    """What the header of a picture file says.
 
     Attributes:
         size: width and height in pixels, upright.
@@ -32,10 +32,10 @@ class Header(NamedTuple):
 
 
 def read_image(path: Path) -> Float32[np.ndarray, "H W 3"]:
-    """Read a picture, grey or colour, upright; alpha is dropped, and where colours are multiplied by it, divided out.
+    """Read a grey or colour picture, upright; alpha is dropped, and premultiplied colours are divided by it.
 
-    Integers of any depth are sRGB values, as cameras write them. Floating-point values (EXR, Radiance HDR, TIFF) are
-    linear light unless the file says otherwise: they are clipped to [0, 1] and converted.
+    Integers of any bit depth are sRGB values, as cameras write them. Floating-point values (EXR, Radiance HDR, TIFF)
+    are linear light unless the file says otherwise: they are clipped to [0, 1] and converted.
 
     Raises:
         UserError: the file is missing, cannot be read whole, or holds values that are not finite.
@@ -48,17 +48,17 @@ def read_image_and_alpha(path: Path) -> tuple[Float32[np.ndarray, "H W 3"], Floa
     color, alpha, associated, linear = _read(path)
     if alpha is not None and associated:
         color = np.divide(color, alpha, out=color.copy(), where=alpha > 0)
-    return _displayed(color, linear), alpha
+    return _as_srgb(color, linear), alpha
 
 
 def read_over_black(path: Path) -> Float32[np.ndarray, "H W 3"]:
-    """Like `read_image`, but composited over black, in the values that the file holds."""
+    """Like `read_image`, but composited over black, before any conversion from linear light to sRGB."""
     color, alpha, associated, linear = _read(path)
-    return _displayed(color if alpha is None or associated else color * alpha, linear)
+    return _as_srgb(color if alpha is None or associated else color * alpha, linear)
 
 
 def _read(path: Path) -> tuple[Float32[np.ndarray, "H W 3"], Float32[np.ndarray, "H W 1"] | None, bool, bool]:
-    """Colour as stored and alpha, whether the one is multiplied by the other, and whether it is linear light."""
+    """Colour as stored, alpha if any, whether colour is premultiplied by alpha, and whether it is linear light."""
     with closing(_open(path)) as file:
         spec = file.spec()
         pixels = file.read_image(oiio.FLOAT)
@@ -78,7 +78,7 @@ def _read(path: Path) -> tuple[Float32[np.ndarray, "H W 3"], Float32[np.ndarray,
     )
 
 
-def _displayed(color: Float32[np.ndarray, "H W 3"], linear: bool) -> Float32[np.ndarray, "H W 3"]:
+def _as_srgb(color: Float32[np.ndarray, "H W 3"], linear: bool) -> Float32[np.ndarray, "H W 3"]:
     """Stored colour as sRGB values."""
     return linear_to_srgb(np.clip(color, 0, 1)) if linear else color
 
@@ -87,7 +87,7 @@ def read_header(path: Path) -> Header:
     """What a picture's header says.
 
     Raises:
-        UserError: the file is missing or no picture.
+        UserError: the file is missing or not a picture.
     """
     with closing(_open(path)) as file:
         spec = file.spec()
@@ -97,7 +97,7 @@ def read_header(path: Path) -> Header:
 
 
 def write_image(path: Path, image: Shaped[np.ndarray, "H W *C"]) -> None:
-    """Write an image of integers, or of floats to EXR, whole or not at all; the ending of `path` says the format.
+    """Write an image of integers, or of floats to EXR, whole or not at all; the suffix of `path` gives the format.
 
     Raises:
         UserError: the file cannot be written.
@@ -116,16 +116,16 @@ def to_bytes(image: Float[np.ndarray, "*shape"] | Bool[np.ndarray, "*shape"]) ->
 
 
 def encode_jpeg(picture: UInt8[np.ndarray, "H W 3"], quality: int) -> bytes:
-    """Content of a JPEG file, of a quality up to 100."""
+    """Content of a JPEG file; `quality` is at most 100."""
     _, content = cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
     return content.tobytes()
 
 
 def area_average(image: Float32[np.ndarray, "H W C"], factor: int) -> Float32[np.ndarray, "h w C"]:
-    """Shrink by a whole factor, each pixel the mean of a block.
+    """Shrink by an integer factor; each pixel is the mean of a block.
 
-    Rows and columns that fill no block are cropped from the bottom and the right, so that dividing K by `factor`
-    stays exact.
+    Rows and columns at the bottom and the right that do not fill a block are cropped, so that dividing K by `factor`
+    is exact.
     """
     height, width, channels = image.shape[0] // factor, image.shape[1] // factor, image.shape[2]
     whole = image[: height * factor, : width * factor]
@@ -135,8 +135,8 @@ def area_average(image: Float32[np.ndarray, "H W C"], factor: int) -> Float32[np
 def _open(path: Path) -> oiio.ImageInput:
     if not os.path.isfile(path):
         raise UserError(f"{path}: no such file; expected a picture")
-    # Without this hint OpenImageIO multiplies colours by alpha, and pixels of alpha 0 turn black. What is multiplied
-    # in the file (EXR, some TIFF) stays so all the same.
+    # Without this hint OpenImageIO multiplies colours by alpha, which turns pixels of alpha 0 black. Colours that are
+    # premultiplied in the file (EXR, some TIFF) remain so.
     keep = oiio.ImageSpec()
     keep.attribute("oiio:UnassociatedAlpha", 1)
     file = oiio.ImageInput.open(str(path), keep)
@@ -146,13 +146,13 @@ def _open(path: Path) -> oiio.ImageInput:
 
 
 def _orientation(spec: oiio.ImageSpec) -> int:
-    """EXIF's number from 1 (upright) to 8."""
+    """EXIF's orientation number, from 1 (upright) to 8."""
     value = spec.getattribute("Orientation")
     return value if isinstance(value, int) and 1 <= value <= 8 else 1
 
 
 def _upright(pixels: Float32[np.ndarray, "h w C"], orientation: int) -> Float32[np.ndarray, "H W C"]:
-    """The picture as it is to be seen, given EXIF's orientation of its stored rows and columns."""
+    """The picture turned upright, given EXIF's orientation of its stored rows and columns."""
     if orientation >= 5:
         pixels = pixels.transpose(1, 0, 2)
     flip_rows = orientation in (3, 4, 7, 8)

@@ -1,4 +1,4 @@
-"""How lenses depart from the pinhole, and pictures without that."""
+"""Lens distortion: its models, and undistorting and distorting pictures."""
 
 import functools
 from typing import NamedTuple
@@ -9,14 +9,14 @@ from jaxtyping import Bool, Float, Float32, Shaped
 
 
 class Lens(NamedTuple):
-    """A distortion in normalised image coordinates; the default is the pinhole.
+    """A distortion in normalised image coordinates; the default is a pinhole camera, without distortion.
 
     Attributes:
-        radial: (k1, k2 ...) of 1 + k1 s + k2 s^2 ..., the factor on the radius; s is the squared radius r^2 or, for a
+        radial: (k1, k2 ...) of the factor on the radius, 1 + k1 s + k2 s^2 ...; s is the squared radius r^2 or, for a
             fisheye, the squared angle theta^2 to the axis.
-        divisor: (k4, k5, k6) of such a polynomial that the factor is divided by, as in OpenCV's rational model.
+        divisor: (k4, k5, k6) of such a polynomial by which the factor is divided, as in OpenCV's rational model.
         tangential: (p1, p2) of the Brown-Conrady model.
-        fisheye: equidistant (OpenCV's fisheye, Kannala-Brandt): the factor is on theta / r as well.
+        fisheye: equidistant projection (OpenCV's fisheye, Kannala-Brandt): the factor also contains theta / r.
     """
 
     radial: tuple[float, ...] = ()
@@ -33,7 +33,7 @@ class Lens(NamedTuple):
 def distort(
     lens: Lens, x: Float[np.ndarray, "*S"], y: Float[np.ndarray, "*S"]
 ) -> tuple[Float[np.ndarray, "*S"], Float[np.ndarray, "*S"]]:
-    """Where the lens images the directions (x, y, 1)."""
+    """Normalised image coordinates at which the lens images the directions (x, y, 1)."""
     r2 = x**2 + y**2
     if lens.fisheye:
         r = np.sqrt(r2)
@@ -55,25 +55,26 @@ def undistort(
 ) -> Float32[np.ndarray, "H W C"]:
     """The picture that the pinhole camera `without_skew(K)` would have taken.
 
-    Pixels that the lens did not see repeat the nearest one that it did.
+    Pixels outside the original picture repeat the nearest one in it.
 
     Args:
         image: as taken through the lens.
         K: intrinsics of `image`, skew included.
         lens: its distortion.
-        nearest: take the value of the nearest pixel, for what must not be mixed; otherwise values are in [0, 1].
+        nearest: whether to take the value of the nearest pixel, for values that must not be mixed, instead of cubic
+            interpolation, which is for values in [0, 1].
     """
     if lens.is_pinhole and K[0, 1] == 0:
         return image
-    columns, rows = _positions(image.shape[1], image.shape[0], tuple(K[:2].ravel().tolist()), lens)
-    if nearest:  # the same pixel as that of the position before it was bent for cubic interpolation
+    columns, rows = _cubic_positions(image.shape[1], image.shape[0], tuple(K[:2].ravel().tolist()), lens)
+    if nearest:  # the correction for cubic interpolation does not change which pixel is nearest
         return cv2.remap(image, columns, rows, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE).reshape(image.shape)
     warped = cv2.remap(image, columns, rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     return np.clip(warped.reshape(image.shape), 0, 1)  # cubic interpolation overshoots
 
 
 def seen(size: tuple[int, int], K: Float[np.ndarray, "3 3"], lens: Lens) -> Bool[np.ndarray, "H W"] | None:
-    """Where `undistort` returns what the lens saw; None if everywhere.
+    """Where the result of `undistort` lies inside the original picture; None if everywhere.
 
     Args:
         size: width and height in pixels.
@@ -86,7 +87,7 @@ def seen(size: tuple[int, int], K: Float[np.ndarray, "3 3"], lens: Lens) -> Bool
 
 
 def distorted(image: Shaped[np.ndarray, "H W"], K: Float[np.ndarray, "3 3"], lens: Lens) -> Shaped[np.ndarray, "H W"]:
-    """What the lens would have imaged of a straight picture: `undistort` the other way round, nearest pixels.
+    """The inverse of `undistort`: what the lens makes of an undistorted picture, by nearest pixels.
 
     Args:
         image: of the pinhole camera `without_skew(K)`.
@@ -95,7 +96,7 @@ def distorted(image: Shaped[np.ndarray, "H W"], K: Float[np.ndarray, "3 3"], len
     """
     if lens.is_pinhole and K[0, 1] == 0:
         return image
-    columns, rows = _origins(image.shape[1], image.shape[0], tuple(K[:2].ravel().tolist()), lens)
+    columns, rows = _undistorted_positions(image.shape[1], image.shape[0], tuple(K[:2].ravel().tolist()), lens)
     return cv2.remap(image, columns, rows, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
 
 
@@ -118,39 +119,39 @@ def _polynomial(coefficients: tuple[float, ...], s: Float[np.ndarray, "*S"]) -> 
 
 
 @functools.lru_cache(maxsize=4)  # most scenes have one camera
-def _positions(
+def _cubic_positions(
     width: int, height: int, K: tuple[float, ...], lens: Lens
 ) -> tuple[Float32[np.ndarray, "H W"], Float32[np.ndarray, "H W"]]:
-    """What to ask cv2's cubic interpolation for to get the pixels of the straight picture from the distorted one."""
-    columns, rows = _bent(width, height, K, lens)
+    """`_distorted_positions` as cv2's cubic interpolation needs them (see `_for_cubic`)."""
+    columns, rows = _distorted_positions(width, height, K, lens)
     return _for_cubic(columns, width), _for_cubic(rows, height)
 
 
 @functools.lru_cache(maxsize=4)
 def _seen(width: int, height: int, K: tuple[float, ...], lens: Lens) -> Bool[np.ndarray, "H W"] | None:
-    columns, rows = _bent(width, height, K, lens)
+    columns, rows = _distorted_positions(width, height, K, lens)
     # Up to the edges of the outermost pixels; false for NaN.
     inside = (columns >= -0.5) & (columns <= width - 0.5) & (rows >= -0.5) & (rows <= height - 0.5)
     return None if inside.all() else inside
 
 
-def _bent(
+def _distorted_positions(
     width: int, height: int, K: tuple[float, ...], lens: Lens
 ) -> tuple[Float32[np.ndarray, "H W"], Float32[np.ndarray, "H W"]]:
-    """Column and row of the distorted picture, centres counted from 0, that each pixel of the straight one shows."""
+    """For each pixel of the undistorted picture, its column and row in the distorted one; pixel 0 is centred at 0."""
     fx, skew, cx, _, fy, cy = K
-    x = ((np.arange(width) + 0.5 - cx)[None, :] / fx).astype(np.float32)  # to a thousandth of a pixel; twice as fast
+    x = ((np.arange(width) + 0.5 - cx)[None, :] / fx).astype(np.float32)  # exact to 1/1000 pixel; twice as fast
     y = ((np.arange(height) + 0.5 - cy)[:, None] / fy).astype(np.float32)
-    with np.errstate(all="ignore"):  # a nonsensical lens leads out of the picture
+    with np.errstate(all="ignore"):  # a nonsensical lens gives positions outside the picture
         lens_x, lens_y = distort(lens, *np.broadcast_arrays(x, y))
         return fx * lens_x + skew * lens_y + cx - 0.5, fy * lens_y + cy - 0.5
 
 
 @functools.lru_cache(maxsize=4)
-def _origins(
+def _undistorted_positions(
     width: int, height: int, K: tuple[float, ...], lens: Lens
 ) -> tuple[Float32[np.ndarray, "H W"], Float32[np.ndarray, "H W"]]:
-    """Column and row of the straight picture, centres counted from 0, that each pixel of the distorted one shows."""
+    """For each pixel of the distorted picture, its column and row in the undistorted one; pixel 0 is centred at 0."""
     fx, skew, cx, _, fy, cy = K
     y = np.broadcast_to((np.arange(height) + 0.5 - cy)[:, None] / fy, (height, width))
     x = ((np.arange(width) + 0.5 - cx)[None, :] - skew * y) / fx
@@ -164,16 +165,17 @@ def _origins(
     return columns, rows
 
 
-# Each step leaves 1 - s of an error, s being the slope of the distortion: a quarter 60 degrees off a fisheye's axis.
+# Each step multiplies the error by 1 - s, where s is the slope of the distortion: 1/4 at 60 degrees from a fisheye's
+# axis.
 _SOLVER_STEPS = 40
 
-# cv2's cubic kernel (a = -0.75) shows a ramp, at the offset o from a pixel, as 1.5 o - 1.5 o^2 + o^3, up to 0.05 pixels
-# off. This is the inverse, for offsets in steps of 1 / 4096.
-_OFFSETS = (0.5 + np.sinh(np.arcsinh(4 * np.linspace(0, 1, 4097) - 2) / 3)).astype(np.float32)
+# At an offset o from a pixel, cv2's cubic kernel (a = -0.75) interpolates a ramp as 1.5 o - 1.5 o^2 + o^3, up to 0.05
+# pixels off. This is the inverse function, for offsets in steps of 1 / 4096.
+_CUBIC_OFFSETS = (0.5 + np.sinh(np.arcsinh(4 * np.linspace(0, 1, 4097) - 2) / 3)).astype(np.float32)
 
 
 def _for_cubic(positions: Float32[np.ndarray, "H W"], length: int) -> Float32[np.ndarray, "H W"]:
-    """What to ask cv2's cubic interpolation for to get the values at `positions`; far ones come near the border."""
+    """Positions at which cv2's cubic interpolation returns the values at `positions`; far ones move near the border."""
     positions = np.clip(np.nan_to_num(positions, nan=-8), -8, length + 8)
     whole = np.floor(positions)
-    return whole + _OFFSETS[np.rint(4096 * (positions - whole)).astype(np.int32)]
+    return whole + _CUBIC_OFFSETS[np.rint(4096 * (positions - whole)).astype(np.int32)]

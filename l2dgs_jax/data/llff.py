@@ -2,10 +2,10 @@
 
     poses_bounds.npy   [F, 17]: pose [3, 5] (axes down, right, back; position; height, width, focal length), near, far
     images/<name>, in the order of their names   [images_<k>/<name>, k times smaller]
-    [a point cloud, see `clouds.find`, else sparse/ as COLMAP has it]
-    [dataset.json]   [metadata.json]   as Nerfies has them
+    [a point cloud, see `clouds.find`, or else COLMAP's sparse/]
+    [dataset.json]   [metadata.json]   as in the layout of Nerfies
 
-Alpha 0 marks pixels that do not count.
+Brackets mark what is optional. Alpha 0 marks pixels that do not count.
 """
 
 from pathlib import Path
@@ -23,28 +23,28 @@ from l2dgs_jax.data.writing import write_lists, write_pictures
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.runtime.files import new_folder
 
-FILE = "poses_bounds.npy"
-_AXES = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1]])  # (down, right, back) from (right, down, forward), and back
+POSES_FILE = "poses_bounds.npy"
+_AXES = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1]])  # (down, right, back) <-> (right, down, forward): its own inverse
 
 
 def recognizes(folder: Path) -> bool:
-    """Whether the folder has this layout, and not also the COLMAP model that its poses come from, which knows more."""
-    return (folder / FILE).is_file() and colmap_model.find(folder) is None
+    """Whether the folder has this layout, and no COLMAP model, which would hold more than the poses made from it."""
+    return (folder / POSES_FILE).is_file() and colmap_model.find(folder) is None
 
 
 def read(folder: Path, downscale: int, held_out: str, frame_memory: float) -> Dataset:
-    """Read a scene; without a point cloud, random points fill the views between the bounds.
+    """Read a scene; without a point cloud, random points fill the views between the near and far bounds.
 
     Args:
         folder: of the scene.
-        downscale: factor on the full size of the images.
+        downscale: integer factor by which images are smaller than full size.
         held_out: see `splits.hold_out`; without lists every eighth frame is held out.
         frame_memory: see `assemble`.
 
     Raises:
         UserError: a file is missing, malformed or inconsistent.
     """
-    path, root = folder / FILE, folder / "images"
+    path, root = folder / POSES_FILE, folder / "images"
     rows = read_array(path, "the frames' poses and bounds, shape (F, 17)").astype(np.float64)
     if rows.ndim != 2 or rows.shape[1] != 17:
         raise UserError(f"{path}: the array has shape {rows.shape}; expected (F, 17)")
@@ -67,11 +67,11 @@ def read(folder: Path, downscale: int, held_out: str, frame_memory: float) -> Da
 
     model, cloud = colmap_model.find(folder), clouds.find(folder)
     if cloud is None and model:
-        cloud = colmap_model.read_points(model)  # in the same world, as the poses come from it
+        cloud = colmap_model.read_points(model)  # in the same world, because the poses come from this model
     if cloud is None:
         viewmats, Ks, _, sizes = zip(*described.values(), strict=True)
         cloud = clouds.in_frusta(np.stack(viewmats), np.stack(Ks), sizes[0], rows[:, 15:]), None
-        stand_in = f"{clouds.COUNT} random points between the bounds stand in for one"
+        stand_in = f"{clouds.RANDOM_POINTS} random points between the bounds stand in for one"
         notes = (*notes, f"{folder} has no point cloud: {stand_in}")
     return assemble(folder, frames(train), frames(test), *cloud, downscale, frame_memory, notes)
 
@@ -80,8 +80,7 @@ def write(dataset: Dataset, folder: Path) -> None:
     """Write a scene so that `read` gives it back; pictures get 8 bits.
 
     Raises:
-        UserError: a camera is not one that the layout can describe; or the folder holds files already or cannot be
-            written.
+        UserError: the layout cannot describe a camera; or the folder holds files already or cannot be written.
     """
     rows = {}
     for split in (dataset.train, dataset.test):
@@ -97,8 +96,8 @@ def write(dataset: Dataset, folder: Path) -> None:
     with new_folder(folder) as target:
         write_pictures(dataset, target / "images", target)
         write_lists(dataset, target)
-        np.save(target / FILE, np.stack([rows[name] for name in sorted(rows)]))
-        clouds.write_ply(target / clouds.FILES[0], dataset.points, dataset.colors)
+        np.save(target / POSES_FILE, np.stack([rows[name] for name in sorted(rows)]))
+        clouds.write_ply(target / clouds.CLOUD_FILES[0], dataset.points, dataset.colors)
 
 
 def _camera(

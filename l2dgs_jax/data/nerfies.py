@@ -1,10 +1,10 @@
-"""The layout of Nerfies (arXiv 2011.12948), HyperNeRF, DyCheck (arXiv 2210.13445) and their kin.
+"""The layout of Nerfies (arXiv 2011.12948), HyperNeRF, DyCheck (arXiv 2210.13445) and similar data sets.
 
     camera/<id>.json   rgb/<k>x/<id>.png   dataset.json   [metadata.json]   [scene.json]
     points.npy   [points_rgb.npy]
 
-Instead of the lists in `dataset.json` there may be `splits/{train,val}.json`. The alpha of DyCheck's pictures says
-which pixels are valid.
+Brackets mark what is optional. The lists of `dataset.json` may be in `splits/{train,val}.json` instead. The alpha of
+DyCheck's pictures says which pixels are valid.
 """
 
 from pathlib import Path
@@ -30,11 +30,11 @@ def recognizes(folder: Path) -> bool:
 
 
 def read(folder: Path, downscale: int, held_out: str, frame_memory: float) -> Dataset:
-    """Read a scene. World units are those of the scene file: X' = (X - center) * scale.
+    """Read a scene. World coordinates are normalised as `scene.json` says: X' = (X - center) * scale.
 
     Args:
         folder: of the scene.
-        downscale: factor on the full size of the images.
+        downscale: integer factor by which images are smaller than full size.
         held_out: see `splits.hold_out`.
         frame_memory: see `assemble`.
 

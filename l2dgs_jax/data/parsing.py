@@ -1,4 +1,4 @@
-"""Values from JSON and NumPy files, or one sentence on what is wrong with them."""
+"""Reading values from JSON and NumPy files, with one-sentence errors."""
 
 import json
 import os
@@ -18,7 +18,7 @@ def read_json(path: Path, what: str) -> dict[str, Any]:
     """The object in a JSON file; `what` says what it should describe.
 
     Raises:
-        UserError: the file is missing, no JSON, or holds something else.
+        UserError: the file is missing, not JSON, or holds something else than an object.
     """
     if not os.path.isfile(path):
         raise UserError(f"{path}: no such file; expected {what}")
@@ -32,7 +32,7 @@ def read_json(path: Path, what: str) -> dict[str, Any]:
 
 
 def read_array(path: Path, what: str, finite: bool = True) -> np.ndarray:
-    """The real numbers in an .npy file, all `finite` unless said otherwise; `what` says what they should be.
+    """The real numbers in an .npy file, which must be finite unless `finite` is False; `what` describes them.
 
     Raises:
         UserError: the file is missing, damaged, or holds something else.
@@ -43,7 +43,7 @@ def read_array(path: Path, what: str, finite: bool = True) -> np.ndarray:
         # Opened here, because numpy leaves some damaged files open.
         with open(path, "rb") as file:
             values = np.load(file, allow_pickle=False)
-    except Exception as error:  # a damaged header makes NumPy raise any of a dozen kinds
+    except Exception as error:  # for damaged headers NumPy raises a dozen different types
         reason = str(error).partition("\n")[0]
         raise UserError(f"{path}: not a NumPy array of numbers ({reason}); expected {what}") from None
     if not isinstance(values, np.ndarray) or values.dtype.kind not in "iuf":
@@ -54,7 +54,7 @@ def read_array(path: Path, what: str, finite: bool = True) -> np.ndarray:
 
 
 def value(path: Path, content: dict[str, Any], key: str, kind: type) -> Any:
-    """The value of a key, of that JSON type.
+    """The value of a key, which must have the type `kind`.
 
     Raises:
         UserError: it is missing or of another type.
@@ -67,19 +67,19 @@ def value(path: Path, content: dict[str, Any], key: str, kind: type) -> Any:
 
 
 def name_list(path: Path, content: dict[str, Any], key: str) -> list[str]:
-    """The names that a key lists.
+    """The names in the list of a key.
 
     Raises:
-        UserError: it is missing or no list.
+        UserError: it is missing or not a list.
     """
     return [str(name) for name in value(path, content, key, list)]
 
 
 def numbers(path: Path | str, content: dict[str, Any], key: str, shape: tuple[int, ...]) -> Float64[np.ndarray, "..."]:
-    """The finite numbers of a key, as an array of that shape; `path` may say where in the file.
+    """The finite numbers of a key, as an array of that shape; `path` may also say where in the file they are.
 
     Raises:
-        UserError: it is missing or something else.
+        UserError: the key is missing, or its value is something else.
     """
     wanted = f"{'x'.join(map(str, shape))} numbers" if shape else "a number"
     if key not in content:
@@ -94,13 +94,13 @@ def numbers(path: Path | str, content: dict[str, Any], key: str, shape: tuple[in
 
 
 def rotation(what: str, matrix: Float64[np.ndarray, "3 3"]) -> Float64[np.ndarray, "3 3"]:
-    """The matrix, once it is found to be a rotation to about a thousandth; `what` names it.
+    """Check that a matrix is a rotation, to about a thousandth, and return it; `what` names it in the message.
 
     Raises:
-        UserError: it is none.
+        UserError: it is not a rotation.
     """
     with np.errstate(all="ignore"):
         close = np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-3)
     if not (close and np.linalg.det(matrix) > 0):
-        raise UserError(f"{what} is no rotation; expected an orthonormal matrix of determinant 1")
+        raise UserError(f"{what} is not a rotation; expected an orthonormal matrix of determinant 1")
     return matrix

@@ -1,4 +1,4 @@
-"""Which files hold the pictures of a scene's frames."""
+"""Finding the files of the pictures of a scene's frames."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -33,13 +33,13 @@ def stored(root: Path, downscale: int, names: Sequence[str]) -> list[Picture]:
 
 
 def stored_if_any(root: Path, downscale: int, names: Sequence[str], all_or_none: bool) -> tuple[list[Picture], str]:
-    """Like `stored`, but no pictures at all if none can be used, and a note if there are some nonetheless.
+    """Like `stored`, but returns no pictures if they cannot be used, and then a note if there are some.
 
     Args:
-        root: which folder holds `<k>x/<name>.<suffix>`.
+        root: folder that holds `<k>x/<name>.<suffix>`.
         downscale: what k must divide.
         names: of the frames.
-        all_or_none: whether pictures of some frames only are an error, and not just of no use.
+        all_or_none: whether it is an error if only some of the frames have a picture; otherwise none is used.
 
     Raises:
         UserError: `all_or_none`, and some frames have a picture and some do not.
@@ -60,17 +60,17 @@ def stored_if_any(root: Path, downscale: int, names: Sequence[str], all_or_none:
 def copies(scene: Path, root: Path, downscale: int, files: Mapping[str, str]) -> list[Picture]:
     """Each frame's picture in `root`, or in `<root>_<k>` beside it for the largest such k that divides `downscale`.
 
-    Only folders within the `scene`'s are looked at.
+    Folders `<root>_<k>` are ignored if `root` is the scene's own folder, because they would lie outside the scene.
 
     Args:
         scene: the scene's folder.
         root: the folder of the pictures in full size.
         downscale: what k must divide.
-        files: by frames' names, without a suffix, the paths within `root` of the files that are meant; files of
-            another suffix stand in for those that are not there.
+        files: for each frame's name, without a suffix, the path of its file within `root`; where that does not exist, a
+            file of another suffix is used.
 
     Raises:
-        UserError: pictures of frames are missing, or it is not clear which is meant.
+        UserError: pictures of frames are missing, or several files could be meant.
     """
     factors = [k for k in range(downscale, 1, -1) if downscale % k == 0 and root != scene]
     scale = next((k for k in factors if root.with_name(f"{root.name}_{k}").is_dir()), 1)
@@ -79,14 +79,14 @@ def copies(scene: Path, root: Path, downscale: int, files: Mapping[str, str]) ->
     missing = [name for name in files if name not in found]
     if missing:
         raise UserError(
-            f"{folder}: holds {len(found)} pictures, but none of {len(missing)} of the {len(files)} frames, such as "
-            f"'{missing[0]}'; expected every frame's"
+            f"{folder}: holds {len(found)} pictures, but none for {len(missing)} of the {len(files)} frames, such as "
+            f"'{missing[0]}'; expected one for every frame"
         )
     return [Picture(only(found[name], folder / file), scale) for name, file in files.items()]
 
 
 def by_name(folder: Path, suffixes: Sequence[str] = SUFFIXES) -> dict[str, list[Path]]:
-    """Files of pictures, or of other `suffixes`, by their path within the folder, without the suffix."""
+    """Picture files, or files with other `suffixes`, by their path within the folder without the suffix."""
     files: dict[str, list[Path]] = {}
     for path in sorted(folder.rglob("*")):
         if path.suffix.lower() in suffixes:
@@ -95,11 +95,15 @@ def by_name(folder: Path, suffixes: Sequence[str] = SUFFIXES) -> dict[str, list[
 
 
 def only(files: Sequence[Path], meant: Path | None = None) -> Path:
-    """The one of several pictures of a name that is meant, or the only one."""
+    """Of the picture files of one name, the one that is `meant`, or else the only one.
+
+    Raises:
+        UserError: there are several, and none of them is `meant`.
+    """
     if meant and meant in files:
         return meant
     if len(files) > 1:
-        raise UserError(f"{files[0]}: is {files[1].name} under another suffix; expected one file for each frame")
+        raise UserError(f"{files[0]}: differs from {files[1].name} only in its suffix; expected one file per frame")
     return files[0]
 
 
@@ -113,7 +117,7 @@ def _coarsest(root: Path, downscale: int) -> tuple[Path, int]:
 
 
 def scales(root: Path, downscale: int) -> tuple[str, int]:
-    """The factors k of the folders `<k>x`, in words, and the largest of them that divides `downscale`, else 0."""
+    """The factors k of the folders `<k>x` as text, and the largest of them that divides `downscale`, or else 0."""
     held = sorted(int(match[1]) for path in root.iterdir() if (match := _SCALE.fullmatch(path.name)))
     largest = max((factor for factor in held if downscale % factor == 0), default=0)
     return ", ".join(f"{factor}x" for factor in held) or "no folder like 1x", largest

@@ -1,4 +1,4 @@
-"""Which frames are held out, and the instants of frames: what the files say, else rules."""
+"""Which frames are held out, and the frames' instants: as the scene's files say, or else by rules."""
 
 import re
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ _DIGITS = re.compile(r"[0-9]+")
 
 
 def check_rule(rule: str) -> None:
-    """Complain if `hold_out` does not know the rule.
+    """Check that `hold_out` knows the rule.
 
     Raises:
         UserError: it does not.
@@ -32,16 +32,16 @@ def hold_out(
     """Names to train on and names held out, and a note if the rule leaves frames out of both.
 
     Args:
-        source: what lists the frames, for messages.
+        source: the file that lists the frames, for messages.
         names: all frames in order.
         own: the scene's own lists, empty if it has none.
-        rule: "auto" (the scene's own lists, else the default), "4dgs" (arXiv 2310.08528: train on every fourth frame,
-            hold out those halfway between), or a number k: the first and then every k-th are held out, the others
-            trained on (3DGS, arXiv 2308.04079, with 8).
+        rule: "auto" (the scene's own lists, or else the default rule), "4dgs" (arXiv 2310.08528: train on every fourth
+            frame, hold out those halfway between), or a number k: the first and then every k-th frame are held out,
+            and the others trained on (3DGS, arXiv 2308.04079, with 8).
         default: the rule for scenes of this layout without lists.
 
     Raises:
-        UserError: too few frames on either side.
+        UserError: there are too few frames to train on or held out.
     """
     notes: tuple[str, ...] = ()
     if rule == "auto" and own[1]:
@@ -65,10 +65,10 @@ def hold_out(
 
 
 def lists(folder: Path) -> tuple[list[str], Lists]:
-    """All frames, and those to train on and held out, of `dataset.json`, else of `splits/{train,val}.json`.
+    """Names of all frames, and those to train on and held out, from `dataset.json` or `splits/{train,val}.json`.
 
     Raises:
-        UserError: neither is there, or one is malformed.
+        UserError: neither exists, or one is malformed.
     """
     path = folder / "dataset.json"
     has_splits = (folder / "splits").is_dir()
@@ -103,11 +103,12 @@ def lists_beside(folder: Path, names: Sequence[str]) -> Lists:
 def instants(folder: Path, names: Sequence[str]) -> dict[str, float]:
     """The frames' instants in [0, 1].
 
-    From `metadata.json`: "time" as `normalised`, else "warp_id" or "time_id" spread over [0, 1]. Without it the last
-    numbers in the names, spread, if all names have one and they differ; else the order of the names.
+    They come from `metadata.json`: "time", `normalised`, or else "warp_id" or "time_id", scaled to [0, 1]. Without it,
+    they are the last numbers in the names, scaled likewise, if all names have one and they differ; or else the order of
+    the names.
 
     Raises:
-        UserError: `metadata.json` is malformed or knows some frames and not others.
+        UserError: `metadata.json` is malformed, or has entries for some of the frames only.
     """
     path = folder / "metadata.json"
     metadata = read_json(path, "the frames' instants") if path.exists() else {}
@@ -123,13 +124,13 @@ def instants(folder: Path, names: Sequence[str]) -> dict[str, float]:
 
 
 def normalised(times: Float[np.ndarray, " F"]) -> Float[np.ndarray, " F"]:
-    """Times as they are if they lie in [0, 1], else spread over it."""
+    """Times unchanged if they all lie in [0, 1], or else scaled to that range."""
     return times if times.min() >= 0 and times.max() <= 1 else _spread(times)
 
 
 def _spread(values: Float[np.ndarray, " F"]) -> Float[np.ndarray, " F"]:
     if np.abs(values).max() > 1e300:
-        values = values / 4  # no difference overflows
+        values = values / 4  # so that no difference overflows
     return (values - values.min()) / (np.ptp(values) or 1.0)
 
 

@@ -1,4 +1,4 @@
-"""Frames of one size stacked into one array: in memory, or in a temporary file that passes through it."""
+"""Frames of one size stacked into one array: in memory, or in a memory-mapped temporary file."""
 
 import math
 import mmap
@@ -15,10 +15,10 @@ from l2dgs_jax.errors import UserError
 
 
 class MappedArray(np.ndarray):
-    """A read-only array over a mapped file: what is taken from it by index, or frame by frame, is a copy.
+    """A read-only array over a memory-mapped file; indexing it, or iterating over its frames, returns copies.
 
-    The pages that were read are given back at once, to the system's cache of files: of the whole stack, no more than
-    what is just being copied counts as memory of the process.
+    Pages that were read are released at once to the system's file cache, so that only what is being copied counts as
+    memory of the process.
     """
 
     def __getitem__(self, key: Any) -> Any:
@@ -34,11 +34,11 @@ def stacked(
     """The frames as one array, without ever holding them twice.
 
     Args:
-        frames: as many as the first number of `shape`, each of the shape that the others give.
+        frames: `shape[0]` frames, each of shape `shape[1:]`.
         shape: of the stack.
         dtype: of the stack.
-        in_file: return a `MappedArray`. Its file has no name, in the folder for temporary files that TMPDIR names, and
-            is gone with the last use of the array, however the process ends.
+        in_file: whether to return a `MappedArray`. Its file lies, without a name, in the folder for temporary files
+            (TMPDIR), and vanishes when the array is no longer used, however the process ends.
 
     Raises:
         UserError: there is no room for the file.
@@ -51,7 +51,7 @@ def stacked(
         return stack
     try:
         with tempfile.TemporaryFile() as file:
-            if hasattr(os, "posix_fallocate"):  # a full disk should be known before the first frame is made
+            if hasattr(os, "posix_fallocate"):  # so that a full disk is noticed before the first frame is made
                 os.posix_fallocate(file.fileno(), 0, size)
             for _, frame in zip(range(shape[0]), frames, strict=True):
                 file.write(np.ascontiguousarray(frame, dtype).data)
@@ -67,7 +67,7 @@ def stacked(
 def pixel_mean(
     stack: Shaped[np.ndarray, "F H W *C"], valid: Bool[np.ndarray, "F H W"] | None = None
 ) -> Float[np.ndarray, "*C"]:
-    """The mean over all pixels, or all `valid` ones, frame by frame."""
+    """The mean over all pixels, or all `valid` ones; only one frame at a time is in memory."""
     total, count = np.zeros(stack.shape[3:]), 0
     for index, frame in enumerate(stack):
         counted = np.ones(frame.shape[:2], bool) if valid is None else valid[index]

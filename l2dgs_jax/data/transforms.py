@@ -2,10 +2,10 @@
 
     transforms.json, or transforms_{train,test,val}.json     frames, cameras (axes right, up, back) and instants
     the pictures that they name   [images_<k>/<name> beside images/<name>, k times smaller]
-    [a point cloud, see `clouds.find`]   [dataset.json]   [metadata.json]   as Nerfies has them
+    [a point cloud, see `clouds.find`]   [dataset.json]   [metadata.json]   as in the layout of Nerfies
 
-Alpha says how much of a pixel the scene covers: pictures are composited over black, which is what a scene renders where
-nothing is.
+Brackets mark what is optional. Alpha says how much of a pixel the scene covers: pictures are composited over black,
+which is also what is rendered where nothing is drawn.
 """
 
 import os
@@ -28,7 +28,7 @@ from l2dgs_jax.data.writing import write_pictures
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.runtime.files import new_folder, write_json
 
-Entry = tuple[Path, dict[str, Any], Path]  # the file that lists a frame, what it says of it, and the frame's picture
+Entry = tuple[Path, dict[str, Any], Path]  # the file that lists a frame, the frame's values in it, and its picture
 
 _PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
 _FISHEYE = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
@@ -44,7 +44,7 @@ def read(folder: Path, downscale: int, held_out: str, frame_memory: float) -> Da
 
     Args:
         folder: of the scene.
-        downscale: factor on the full size of the images.
+        downscale: integer factor by which images are smaller than full size.
         held_out: see `splits.hold_out`; without lists every eighth frame is held out.
         frame_memory: see `assemble`.
 
@@ -59,10 +59,10 @@ def read(folder: Path, downscale: int, held_out: str, frame_memory: float) -> Da
     pictures = _pictures(folder, {name: entries[name][2] for name in [*train, *test]}, downscale)
     frames = {name: _frame(name, *entries[name], times[name], picture) for name, picture in pictures.items()}
 
-    cloud = clouds.find(folder, ply)  # not from sparse/: programs move and scale the world that COLMAP found
+    cloud = clouds.find(folder, ply)  # not from sparse/, whose world other programs have moved and scaled
     if cloud is None:
         cloud = clouds.in_common_box(np.stack([frame.viewmat for frame in frames.values()]), str(folder)), None
-        stand_in = f"{clouds.COUNT} random points where its cameras look stand in for one"
+        stand_in = f"{clouds.RANDOM_POINTS} random points where its cameras look stand in for one"
         notes = (*notes, f"{folder} has no point cloud: {stand_in}")
     return assemble(
         folder, [frames[n] for n in train], [frames[n] for n in test], *cloud, downscale, frame_memory, notes
@@ -70,11 +70,11 @@ def read(folder: Path, downscale: int, held_out: str, frame_memory: float) -> Da
 
 
 def write(dataset: Dataset, folder: Path) -> None:
-    """Write a scene as nerfstudio has it so that `read` gives it back; pictures get 8 bits.
+    """Write a scene in nerfstudio's layout so that `read` gives it back; pictures get 8 bits.
 
     Raises:
-        UserError: some pixels are not valid, which the layout cannot say; or the folder holds files already or cannot
-            be written.
+        UserError: some pixels are not valid, which the layout cannot express; or the folder holds files already or
+            cannot be written.
     """
     files: dict[str, list[str]] = {"train": [], "val": []}
     frames = []
@@ -91,7 +91,7 @@ def write(dataset: Dataset, folder: Path) -> None:
         "camera_model": "OPENCV",
         "w": dataset.width,
         "h": dataset.height,
-        "ply_file_path": clouds.FILES[0],
+        "ply_file_path": clouds.CLOUD_FILES[0],
         "train_filenames": files["train"],
         "val_filenames": files["val"],
         "test_filenames": files["val"],
@@ -100,19 +100,19 @@ def write(dataset: Dataset, folder: Path) -> None:
     with new_folder(folder) as target:
         write_pictures(dataset, target / "images", target)
         write_json(target / "transforms.json", content)
-        clouds.write_ply(target / clouds.FILES[0], dataset.points, dataset.colors)
+        clouds.write_ply(target / clouds.CLOUD_FILES[0], dataset.points, dataset.colors)
 
 
 def world_to_camera(source: str, key: str, matrix: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "4 4"]:
-    """The rigid matrix of a camera with OpenGL's axes to the world, inverted and with OpenCV's.
+    """World-to-camera matrix with OpenCV's axes, from a camera-to-world matrix with OpenGL's axes.
 
     Args:
-        source: where it is from, for messages.
-        key: what it is called there.
-        matrix: camera to world.
+        source: where the matrix is from, for messages.
+        key: its name there.
+        matrix: camera to world, rigid.
 
     Raises:
-        UserError: it is not rigid.
+        UserError: the matrix is not rigid.
     """
     rotation(f"{source}: '{key}'", matrix[:3, :3])
     if not np.allclose(matrix[3], [0, 0, 0, 1]):
@@ -121,7 +121,7 @@ def world_to_camera(source: str, key: str, matrix: Float64[np.ndarray, "4 4"]) -
 
 
 def _entries(folder: Path) -> tuple[dict[str, Entry], Lists, str | None]:
-    """Every frame by name, the layout's own lists, and the point cloud that it names."""
+    """All frames by name, the lists of training and held-out frames, and the point cloud that the file names."""
     single = folder / "transforms.json"
     if single.is_file():
         content = read_json(single, "the frames")
@@ -145,15 +145,15 @@ def _entries(folder: Path) -> tuple[dict[str, Entry], Lists, str | None]:
         for name, (*_, picture) in found.items():
             if name in entries and not entries[name][2].samefile(picture):
                 raise UserError(
-                    f"{path}: frame {picture} is '{name}' as {entries[name][2]} is; expected names that differ"
+                    f"{path}: frames {picture} and {entries[name][2]} are both '{name}'; expected names that differ"
                 )
-        lists.append([name for name in found if name not in entries])  # what is trained on is not held out as well
+        lists.append([name for name in found if name not in entries])  # training frames are not held out as well
         entries = {**entries, **found, **entries}
     return entries, (lists[0], lists[1]), None
 
 
 def _listed(path: Path, content: dict[str, Any]) -> dict[str, Entry]:
-    """The frames of a file, with what it says of all of them, in the order of their names."""
+    """The frames that a file lists, in the order of their names; each has the file's common values as well."""
     shared = {key: entry for key, entry in content.items() if key != "frames"}
     entries: dict[str, Entry] = {}
     for i, frame in enumerate(value(path, content, "frames", list)):
@@ -170,7 +170,7 @@ def _listed(path: Path, content: dict[str, Any]) -> dict[str, Entry]:
 
 
 def _picture(path: Path, file: str) -> Path:
-    """The file that an entry names, with or without its suffix."""
+    """The picture that an entry names, with or without its suffix."""
     named = path.parent / file
     candidates = [named, *(named.with_name(f"{named.name}{suffix}") for suffix in SUFFIXES if named.name)]
     found = next((candidate for candidate in candidates if os.path.isfile(candidate)), None)
@@ -180,14 +180,14 @@ def _picture(path: Path, file: str) -> Path:
 
 
 def _name(folder: Path, picture: Path) -> str:
-    """A picture's path without its suffix, relative to `images` or to the scene, never upwards."""
+    """A picture's path without its suffix, relative to `images` or to the scene, without `..`."""
     parts = Path(os.path.relpath(picture, folder)).with_suffix("").parts
     within = parts[1:] if parts[0] == "images" else parts
     return "/".join(part for part in within or parts if part != os.pardir)
 
 
 def _times(folder: Path, entries: dict[str, Entry]) -> dict[str, float]:
-    """The frames' own instants, else those of `splits.instants`."""
+    """The frames' own instants, or else those of `splits.instants`."""
     if not any("time" in content for _, content, _ in entries.values()):
         return splits.instants(folder, list(entries))
     times = np.array([float(numbers(path, content, "time", ())) for path, content, _ in entries.values()])

@@ -1,4 +1,4 @@
-"""What the writers of all layouts share: pictures, truth, masks and depth, lists of frames and instants."""
+"""What the writers of all layouts share: pictures, ground truth, masks and depth, lists of frames and instants."""
 
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ from l2dgs_jax.runtime.files import write_json
 
 
 def write_pictures(dataset: Dataset, root: Path, folder: Path) -> None:
-    """Write the frames as `root/<name>.png`, alpha 0 where they are not valid, and what `assemble` finds in `folder`.
+    """Write the frames as `root/<name>.png`, alpha 0 where not valid; ground truth, masks and depth go to `folder`.
 
     Raises:
         UserError: a file cannot be written, or a frame's name leads out of `root`.
@@ -44,7 +44,7 @@ def write_pictures(dataset: Dataset, root: Path, folder: Path) -> None:
 
 
 def write_lists(dataset: Dataset, folder: Path) -> None:
-    """Write `dataset.json`, which frames are held out, and `metadata.json`, their instants."""
+    """Write `dataset.json`, with the held-out frames, and `metadata.json`, with the instants."""
     train, val = dataset.train, dataset.test
     times = {
         name: float(time) for split in (train, val) for name, time in zip(split.names, split.cameras.time, strict=True)
@@ -52,7 +52,7 @@ def write_lists(dataset: Dataset, folder: Path) -> None:
     lists = {"count": len(times), "ids": sorted(times), "train_ids": train.names, "val_ids": val.names}
     instants = {time: rank for rank, time in enumerate(sorted(set(times.values())))}
     write_json(folder / "dataset.json", lists)
-    # Other programs know whole numbers only.
+    # "warp_id" is for other programs, which read integers only.
     write_json(
         folder / "metadata.json", {name: {"warp_id": instants[time], "time": time} for name, time in times.items()}
     )

@@ -9,7 +9,7 @@ ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("qu
 
 
 def encode(splats: Splats) -> bytes:
-    """The largest and most opaque Gaussians first, as viewers draw a file while it loads.
+    """Content of a .splat file, with the largest and most opaque Gaussians first, because viewers draw while loading.
 
     A component q of a rotation (wxyz) is stored as 128 q + 128.
     """

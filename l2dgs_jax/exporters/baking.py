@@ -1,9 +1,9 @@
-"""The well-lit scene at an instant as Gaussians that each have one colour, which is what splat viewers draw.
+"""Baking the well-lit scene at an instant into Gaussians with one colour each, which is what splat viewers draw.
 
-The well-lit image is a product of two blended images (Eq. 7), and reflectances may lie outside [0, 1]; a viewer blends
-once, and takes no colours below 0. So the colours are those in a range whose blend comes closest to the exact images of
-some training cameras, in the sense of least squares: a convex problem, as a blend is linear in its colours. Colours
-that show the estimates of the dark frames (Eq. 9) are fitted alike.
+The well-lit image is a product of two blended images (Eq. 7), and reflectances may lie outside [0, 1]. A viewer blends
+only once, and accepts no colours below 0. So colours within a range are fitted by least squares, so that their blend
+matches the exact images of some training cameras. This is a convex problem, because a blend is linear in its colours.
+Colours that show the estimates of the dark frames (Eq. 9) are fitted likewise.
 """
 
 from collections.abc import Iterable, Iterator
@@ -29,17 +29,17 @@ from l2dgs_jax.runtime.capacity import next_capacity
 from l2dgs_jax.runtime.prefetch import prefetch
 from l2dgs_jax.types import Camera, MovedGaussians, RasterOutput, Scene
 
-VIEWS = 8  # training cameras that colours are fitted to; they are checked on those halfway between
-FIRST_ROUNDS, ROUNDS = 24, 6  # of the fit, at the first instant and at others, which start from the one before
-OVERBRIGHT = 1.25  # a brightest colour with which most of what [0, 1] costs is won back; more gains hardly anything
-LEAST_WEIGHT = 1e-9  # summed over all pixels; what is seen less keeps its colour
+FITTED_VIEWS = 8  # training cameras that colours are fitted to; the fit is checked on cameras halfway between them
+FIRST_ITERATIONS, ITERATIONS = 24, 6  # of the fit: at the first instant, and at others, which start from the one before
+OVERBRIGHT = 1.25  # upper limit of colours that recovers most of the loss due to [0, 1]; a higher one hardly helps
+LEAST_WEIGHT = 1e-9  # sum of a Gaussian's weights over all pixels; a Gaussian with less keeps its colour
 
 Image = Literal["welllit", "lowlight"]
 Geometry = tuple[Float[Array, "N 3"], Float[Array, "N 4"], Float[Array, "N 3"], Float[Array, " N"]]
 
 
 class _Canvas(NamedTuple):
-    """What images are drawn on: their size in pixels, the near plane, and the value where nothing is drawn."""
+    """Parameters for drawing images: size in pixels, near plane, and the value where nothing is drawn."""
 
     width: int
     height: int
@@ -50,20 +50,20 @@ class _Canvas(NamedTuple):
 def bake(
     run: Run, times: Iterable[float], brightest: float = 1.0, images: tuple[Image, ...] = ("welllit",)
 ) -> Iterator[tuple[Splats, ...]]:
-    """The scene at each of some instants, one after the other: every Gaussian, in the same order at all of them.
+    """The scene at each of several instants, one after the other: all Gaussians, always in the same order.
 
-    The colours are to be blended over black; over white if `model.background` is 1.
+    The colours are meant to be blended over black, or over white if `model.background` is 1.
 
     Args:
         run: the run.
-        times: instants in [0, 1], best in their order: each starts from the colours of the one before.
-        brightest: upper end of the colours' range: 1, or somewhat more (`OVERBRIGHT`) where nothing clips them before
-            they are blended.
-        images: which images the colours are to show, the well-lit ones first; each makes Gaussians of its own, which
-            differ in their colours only.
+        times: instants in [0, 1], preferably in order, because each fit starts from the colours of the one before.
+        brightest: upper limit of the colours: 1, or somewhat more (`OVERBRIGHT`) if nothing clips them before they are
+            blended.
+        images: the kinds of image to fit colours to, "welllit" first; the result has Gaussians for each, which differ
+            only in their colours.
     """
     scene, cfg, renderer, canvas = run.state.scene, run.config.model, run.renderer(), _canvas(run)
-    colors, rounds = None, FIRST_ROUNDS
+    colors, iterations = None, FIRST_ITERATIONS
     for time in times:
         cameras = _at_instant(run, time, slice(0, None, 2))
         moved = _moved(scene, cameras, renderer.sh_degree, cfg=cfg, moving=run.moving)
@@ -76,13 +76,13 @@ def bake(
             colors = jnp.clip(jnp.tile(own, len(images)) * _gains(levels)[None], 0, brightest)
         _, drawn = _blend(colors, geometry, cameras, canvas)
         room = next_capacity(int(drawn.pairs))
-        colors = _fit(colors, geometry, cameras, exact, rounds, brightest, canvas=canvas, pair_capacity=room)
-        rounds = ROUNDS
+        colors = _fit(colors, geometry, cameras, exact, iterations, brightest, canvas=canvas, pair_capacity=room)
+        iterations = ITERATIONS
         yield _splats(geometry, colors, np.asarray(scene.alive))
 
 
 def closeness(run: Run, splats: Splats, time: float, image: Image = "welllit") -> float:
-    """PSNR of the images of Gaussians against the exact ones of an instant, dB.
+    """PSNR of the images of baked Gaussians against the exact ones at an instant, dB.
 
     It is the mean over training cameras halfway between those that `bake` fits colours to.
     """
@@ -98,16 +98,16 @@ def _fit(
     geometry: Geometry,
     cameras: Camera,
     images: Float[Array, "V H W C"],
-    rounds: Int[Array, ""] | int,
+    iterations: Int[Array, ""] | int,
     brightest: Float[Array, ""] | float,
     *,
     canvas: _Canvas,
     pair_capacity: int,
 ) -> Float[Array, "N C"]:
-    """The colours from 0 to `brightest` whose images have the least squared error, by projected gradients (FISTA).
+    """The colours in [0, `brightest`] whose images have the least squared error, by projected gradients (FISTA).
 
-    The weights of a pixel's Gaussians sum to its alpha. With A of these weights, that makes the row sums of A^T A equal
-    to A^T alpha, and a step of a Gaussian's own gradient over its row sum never too long.
+    Let A be the matrix of the blending weights of all pixels. A pixel's weights sum to its alpha, so the row sums of
+    A^T A are A^T alpha. Dividing each Gaussian's gradient by its row sum gives a step that is never too long.
     """
     blend = partial(_blend, geometry=geometry, cameras=cameras, canvas=canvas, pair_capacity=pair_capacity)
     _, pull, drawn = jax.vjp(blend, colors, has_aux=True)
@@ -120,7 +120,7 @@ def _fit(
         momentum = count.astype(new.dtype) / (count + 3).astype(new.dtype)
         return new, new + momentum * (new - last)
 
-    return jax.lax.fori_loop(0, rounds, step, (colors, colors))[0]
+    return jax.lax.fori_loop(0, iterations, step, (colors, colors))[0]
 
 
 def _blend(
@@ -130,7 +130,7 @@ def _blend(
     canvas: _Canvas,
     pair_capacity: int | None = None,
 ) -> tuple[Float[Array, "V H W C"], RasterOutput]:
-    """The images that a viewer of splats shows, and what else was drawn; gradients flow to the colours."""
+    """The images that a splat viewer shows, and the rasterizer's output; gradients flow to the colours."""
     drawn = rasterize(
         *geometry,
         colors,
@@ -152,12 +152,12 @@ def _moved(
 
 
 def near_plane(run: Run) -> float:
-    """Depth from which on Gaussians are drawn, world units."""
+    """Depth beyond which Gaussians are drawn, world units."""
     return float(NEAR_PLANE * length_unit(run.state.scene.extent, run.config.model))
 
 
 def background(run: Run) -> float:
-    """What the colours are to be blended over, sRGB: the well-lit image where nothing is drawn."""
+    """Background to blend the colours over, sRGB: the value of the well-lit image where nothing is drawn."""
     model = run.config.model
     if model.decomposition != "retinex":
         return model.background
@@ -166,7 +166,7 @@ def background(run: Run) -> float:
 
 
 def _exact(renderer: Renderer, cameras: Camera, kinds: tuple[Image, ...]) -> Float[Array, "V H W C"]:
-    """The images of Eqs. 7 and 9, their channels side by side."""
+    """The exact images of these kinds (Eqs. 7 and 9), their channels concatenated."""
 
     def draw(camera: Camera) -> Float[Array, "H W C"]:
         if kinds == ("welllit",):
@@ -179,7 +179,7 @@ def _exact(renderer: Renderer, cameras: Camera, kinds: tuple[Image, ...]) -> Flo
 
 
 def _gains(levels: Float[Array, " C"]) -> Float[Array, " C"]:
-    """How bright images are on average, over the first of them."""
+    """Mean brightness of each image over that of the first, repeated for its channels."""
     means = levels.reshape(-1, 3).mean(-1)
     return jnp.repeat(means / jnp.maximum(means[:1], LEAST_WEIGHT), 3)
 
@@ -189,9 +189,9 @@ def _canvas(run: Run) -> _Canvas:
 
 
 def _at_instant(run: Run, time: float, every_other: slice) -> Camera:
-    """Training cameras spread over all of them, those for the fit or those between, at one instant."""
+    """Training cameras, spread evenly over all of them, set to one instant; `every_other` picks those to use."""
     cameras = run.dataset.train.cameras
-    spread = np.unique(np.linspace(0, len(cameras.time) - 1, 2 * VIEWS - 1).round().astype(int))
+    spread = np.unique(np.linspace(0, len(cameras.time) - 1, 2 * FITTED_VIEWS - 1).round().astype(int))
     chosen = spread[every_other] if len(spread) > 1 else spread
     viewmat, K = (jnp.asarray(x[chosen], float) for x in (cameras.viewmat, cameras.K))
     return Camera(viewmat, K, jnp.full(len(chosen), time, float))

@@ -9,16 +9,16 @@ from l2dgs_jax.types import Camera
 
 
 def camera_path(cameras: Camera, width: int, height: int, fps: int) -> dict[str, Any]:
-    """The content of a `camera_path.json`: cameras in the order of their instants, the world as it is.
+    """The content of a `camera_path.json`: cameras in the order of their instants, in unchanged world coordinates.
 
-    The format knows neither principal points nor pixels that are not square: what it says is the vertical field of
-    view, in degrees.
+    The format has only the vertical field of view, in degrees, and neither principal points nor pixels that are not
+    square.
 
     Args:
         cameras: F cameras.
         width: of their images, pixels.
         height: of their images, pixels.
-        fps: frames a second at which the path is to be shown.
+        fps: frames per second at which the path is to be shown.
     """
     frames = []
     for i in np.argsort(cameras.time, kind="stable").tolist():

@@ -12,15 +12,15 @@ from l2dgs_jax.data.color import srgb_to_linear
 from l2dgs_jax.exporters.splats import Splats, sh_coefficients
 
 EXTENSION = "KHR_gaussian_splatting"
-UP = (0.0, 1.0, 0.0)  # glTF's
+UP = (0.0, 1.0, 0.0)  # in glTF
 FLOAT, POINTS, ARRAY_BUFFER = 5126, 0, 34962
 TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 
 
 def encode(splats: Splats, up: Float[np.ndarray, "3"]) -> bytes:
-    """A scene of one node, which turns the world so that `up` becomes +Y; what it holds keeps the world's axes.
+    """Content of a .glb file with one node, which rotates the scene so that `up` becomes +Y; its data are not rotated.
 
-    Values are activated and rotations xyzw. Programs that do not know the extension show points of the same colours.
+    Values are activated, and rotations are xyzw. Programs without the extension show points of the same colours.
 
     Args:
         splats: the Gaussians, at least one.
@@ -40,7 +40,7 @@ def encode(splats: Splats, up: Float[np.ndarray, "3"]) -> bytes:
         {"bufferView": i, "componentType": FLOAT, "count": len(array), "type": TYPES[array.shape[1]]}
         for i, array in enumerate(arrays)
     ]
-    accessors[0] |= {"min": arrays[0].min(0).tolist(), "max": arrays[0].max(0).tolist()}  # a position must have them
+    accessors[0] |= {"min": arrays[0].min(0).tolist(), "max": arrays[0].max(0).tolist()}  # required for positions
     primitive = {
         "mode": POINTS,
         "attributes": {name: i for i, name in enumerate(attributes)},
@@ -65,7 +65,7 @@ def encode(splats: Splats, up: Float[np.ndarray, "3"]) -> bytes:
 
 
 def _binary(text: bytes, data: bytes) -> bytes:
-    """The container: a header, and chunks of whole 4-byte words."""
+    """The container: a header and two chunks, each padded to a multiple of 4 bytes."""
     text += b" " * (-len(text) % 4)
     chunks = [struct.pack("<I4s", len(part), kind) + part for kind, part in ((b"JSON", text), (b"BIN\0", data))]
     body = b"".join(chunks)

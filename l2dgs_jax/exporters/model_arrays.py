@@ -1,4 +1,4 @@
-"""A whole scene, decomposed and moving, as named arrays that say all it takes to render it."""
+"""A whole model, decomposed and moving, as named arrays with everything that is needed to render it."""
 
 from typing import Any
 
@@ -13,19 +13,19 @@ from l2dgs_jax.model.deformation import acting, length_unit
 from l2dgs_jax.rasterizer.projection import NEAR_PLANE
 from l2dgs_jax.runs import Run
 
-WHOLE = {"decomposition": "retinex", "ocd": True, "unit_exponent": None}  # settings of a model
+REQUIRED_SETTINGS = {"decomposition": "retinex", "ocd": True, "unit_exponent": None}  # of the model
 
 
 def model_arrays(run: Run) -> dict[str, Shaped[np.ndarray, "..."]]:
-    """The arrays of an exported .npz by name, numbers in single precision; docs/export.md describes each of them.
+    """The arrays of an exported .npz by name, floats in single precision; docs/export.md describes each of them.
 
     Raises:
-        UserError: the scene lacks a part of the model that they are described to be.
+        UserError: the scene lacks a part of the model that these arrays describe.
     """
     scene, cfg, dataset = run.state.scene, run.config.model, run.dataset
-    for name, whole in WHOLE.items():
-        if getattr(cfg, name) != whole:
-            raise UserError(f"{run.name}: its model.{name} is {getattr(cfg, name)}; expected {whole} for a whole model")
+    for name, required in REQUIRED_SETTINGS.items():
+        if getattr(cfg, name) != required:
+            raise UserError(f"{run.name}: model.{name} is {getattr(cfg, name)}; expected {required} for this format")
     params, alive = scene.params, np.asarray(scene.alive)
     gaussians = {name: rows for name, rows in params.gaussians._asdict().items() if rows is not None}
     moved = acting(scene, cfg)

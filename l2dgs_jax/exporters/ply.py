@@ -9,11 +9,11 @@ PROPERTIES = (
     *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"),
     *("scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
 )
-LEAST = 1e-6  # scale in world units, and distance of an opacity from 0 and 1, that keep logarithms finite
+LEAST = 1e-6  # least scale in world units, and least distance of an opacity from 0 and 1: keeps logarithms finite
 
 
 def encode(splats: Splats) -> bytes:
-    """Raw values in single precision: logarithms of scales, logits of opacities, rotations wxyz; normals are zero."""
+    """A PLY file with logarithms of scales, logits of opacities, rotations wxyz and zero normals, single precision."""
     opacities = np.clip(splats.opacities.astype(np.float64), LEAST, 1 - LEAST)
     columns = (
         splats.means,
@@ -28,5 +28,5 @@ def encode(splats: Splats) -> bytes:
 
 
 def encode_cloud(splats: Splats) -> bytes:
-    """The centres of the Gaussians as points with 8-bit colours."""
+    """A PLY file with the centres of the Gaussians as points with 8-bit colours."""
     return encode_ply(colored_points(splats.means, splats.colors.clip(0, 1)))

@@ -1,4 +1,4 @@
-"""Gaussians as viewers of splats draw them."""
+"""Gaussians in the form that splat viewers draw."""
 
 from typing import NamedTuple
 
@@ -29,11 +29,11 @@ class Splats(NamedTuple):
 
 
 def visible(splats: Splats) -> Splats:
-    """Those that leave a trace in some image."""
+    """The Gaussians that are visible in some image; others are too transparent."""
     drawn = splats.opacities >= MIN_ALPHA
     return Splats(*(rows[drawn] for rows in splats))
 
 
 def sh_coefficients(colors: Float32[np.ndarray, "N 3"]) -> Float32[np.ndarray, "N 3"]:
-    """The c of colours 0.5 + c Y_00, which is how files hold them (3DGS, arXiv 2308.04079)."""
+    """Coefficients c of colours 0.5 + c Y_00, which is how files store colours (3DGS, arXiv 2308.04079)."""
     return (colors - np.float32(0.5)) / Y_00

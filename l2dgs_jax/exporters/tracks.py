@@ -1,4 +1,4 @@
-"""Moving Gaussians in few bytes: integers at key instants, between which a viewer interpolates linearly."""
+"""Moving Gaussians in few bytes: quantised values at key instants, between which a viewer interpolates linearly."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -9,18 +9,18 @@ from jaxtyping import Bool, Float, Int, Int8, Shaped, UInt8, UInt16
 from l2dgs_jax.exporters.splats import Splats
 from l2dgs_jax.kernels.tiles import MIN_ALPHA
 
-# A Gaussian keeps still if nothing of it strays further than this from the middle of its range:
+# A Gaussian counts as still if none of its values deviates more than this from the middle of its range over time:
 STILL_PIXELS, STILL_QUAT, STILL_LOG_SCALE, STILL_OPACITY = 0.5, 0.02, 0.05, 0.01
-LARGEST_RATIO = np.exp(12.0)  # of the scales of Gaussians; smaller ones become that small
+LARGEST_SCALE_RATIO = np.exp(12.0)  # between the largest and the smallest scale; smaller scales are raised to it
 
 
 class Geometry(NamedTuple):
-    """Gaussians at K instants, but for their colours.
+    """Gaussians at K instants, except their colours.
 
     Attributes:
-        positions: 0 and 65535 are the corners of the box.
+        positions: 0 to 65535 along each axis of the box.
         quats: rotations wxyz times 127.
-        shapes: logarithms of the scales, of which 0 and 255 are the lowest and the highest, and opacities times 255.
+        shapes: logarithms of the scales, 0 to 255 from the lowest to the highest, and opacities times 255.
     """
 
     positions: UInt16[np.ndarray, "K N 3"]
@@ -29,15 +29,15 @@ class Geometry(NamedTuple):
 
 
 class Tracks(NamedTuple):
-    """Gaussians at K >= 2 instants spread evenly over [0, 1]: S that keep still, then M that move.
+    """Gaussians at K >= 2 key instants, evenly spaced over [0, 1]: S that are still, then M that move.
 
     Attributes:
-        still: one instant, which stands for all.
-        moving: K instants.
-        colors: those of the S + M at K instants for each image, `brightest` being 255.
-        box: lowest and highest corner of all centres, world units.
-        log_scales: lowest and highest.
-        brightest: upper end of the colours' range.
+        still: the still ones, at one instant, which stands for all.
+        moving: the moving ones, at K instants.
+        colors: for each image, colours of all S + M at K instants; 255 means `brightest`.
+        box: lowest and highest corner of the box around all centres, world units.
+        log_scales: lowest and highest logarithm of a scale.
+        brightest: upper limit of the colours.
     """
 
     still: Geometry
@@ -49,12 +49,12 @@ class Tracks(NamedTuple):
 
 
 def quantise(instants: Sequence[tuple[Splats, ...]], pixels: Float[np.ndarray, " N"], brightest: float) -> Tracks:
-    """Tracks of those Gaussians that can be seen at some instant.
+    """Tracks of those Gaussians that are visible at some instant.
 
     Args:
-        instants: at least two; at each, the same Gaussians in the colours of every image.
-        pixels: how much of the world, at each Gaussian, a pixel of the nearest camera spans.
-        brightest: upper end of the colours' range.
+        instants: at least two; for each, the same Gaussians in the colours of every image.
+        pixels: for each Gaussian, the size of a pixel of the nearest camera at its depth, world units.
+        brightest: upper limit of the colours.
     """
     over_time = lambda name: np.stack([np.asarray(getattr(splats[0], name), np.float64) for splats in instants])
     opacities = over_time("opacities")
@@ -63,7 +63,7 @@ def quantise(instants: Sequence[tuple[Splats, ...]], pixels: Float[np.ndarray, "
     hold = lambda rows: np.take_along_axis(rows, held.reshape(*held.shape, *[1] * (rows.ndim - 2)), 0)[:, drawn]
     means, quats, scales = (hold(over_time(name)) for name in ("means", "quats", "scales"))
     opacities, quats = hold(opacities)[..., None], _continuous(quats)
-    log_scales = np.log(np.maximum(scales, max(scales.max(initial=0) / LARGEST_RATIO, np.finfo(float).tiny)))
+    log_scales = np.log(np.maximum(scales, max(scales.max(initial=0) / LARGEST_SCALE_RATIO, np.finfo(float).tiny)))
 
     limits = ((means, STILL_PIXELS * pixels[drawn]), (quats, STILL_QUAT), (log_scales, STILL_LOG_SCALE))
     still = np.all([_stray(rows) <= limit for rows, limit in (*limits, (opacities, STILL_OPACITY))], axis=0)
@@ -110,11 +110,11 @@ def at(tracks: Tracks, time: float) -> tuple[Splats, ...]:
 
 
 def pack(tracks: Tracks) -> bytes:
-    """All integers, arranged so that deflate finds much to save.
+    """All integers as bytes, in an order that deflate compresses well.
 
-    The arrays of `still`, those of `moving`, then the colours; each channel by channel, of each channel the low bytes
-    before the high ones, and of each byte all Gaussians at one key instant after the other. From the second on, an
-    instant holds the differences from the one before, which wrap around.
+    The arrays of `still`, those of `moving`, then the colours. Each array is stored channel by channel, each channel
+    with the low bytes before the high ones, and each of these for all Gaussians, key instant after key instant. From
+    the second key instant on, these are differences from the previous one, modulo the range of the integers.
     """
     return b"".join(map(_planes, (*tracks.still, *tracks.moving, *tracks.colors)))
 
@@ -126,9 +126,9 @@ def _planes(rows: Shaped[np.ndarray, "K N C"]) -> bytes:
 
 
 def _held(seen: Bool[np.ndarray, "K N"]) -> Int[np.ndarray, "K N"]:
-    """Which key instant to take values from: the last one at or beside which a Gaussian is seen.
+    """Key instant to take a Gaussian's values from: the last one at which, or next to which, it is visible.
 
-    What nobody sees then changes nothing, and takes hardly any bytes.
+    Values of invisible Gaussians then do not change, which takes hardly any bytes.
     """
     padded = np.pad(seen, ((1, 1), (0, 0)))
     needed = padded[:-2] | padded[1:-1] | padded[2:]
@@ -136,7 +136,7 @@ def _held(seen: Bool[np.ndarray, "K N"]) -> Int[np.ndarray, "K N"]:
 
 
 def _continuous(quats: Float[np.ndarray, "K N 4"]) -> Float[np.ndarray, "K N 4"]:
-    """The same rotations, each of the sign that is nearer to the one before."""
+    """The same rotations, each quaternion with the sign that is nearer to the previous one."""
     turns = np.where((quats[1:] * quats[:-1]).sum(-1) < 0, -1, 1).cumprod(0)
     return np.concatenate([quats[:1], turns[..., None] * quats[1:]])
 
@@ -148,6 +148,6 @@ def _stray(rows: Float[np.ndarray, "K N C"]) -> Float[np.ndarray, " N"]:
 def _unit(
     values: Float[np.ndarray, "*S"], low: Float[np.ndarray, "..."] | float, high: Float[np.ndarray, "..."] | float
 ) -> Float[np.ndarray, "*S"]:
-    """Where values lie from `low`, 0, to `high`, 1."""
+    """Values scaled from [`low`, `high`] to [0, 1], and clipped."""
     size = np.maximum(np.asarray(high) - low, np.finfo(float).tiny)
     return np.clip((values - low) / size, 0, 1)

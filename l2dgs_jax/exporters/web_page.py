@@ -1,4 +1,4 @@
-"""One page that plays a moving scene in a browser, without a server or a network."""
+"""A self-contained page that plays a moving scene in a browser, without a server or a network."""
 
 import base64
 import html
@@ -24,8 +24,8 @@ from l2dgs_jax.runtime.pages import filled, script_json
 from l2dgs_jax.types import Camera
 
 IMAGES: tuple[Image, ...] = ("welllit", "lowlight")
-CHECKS = 5  # instants at which a page is compared with the exact images
-DEPTH_CAMERAS = 16  # training cameras that tell how near Gaussians come
+CHECKED_INSTANTS = 5  # at which a page is compared with the exact images
+DEPTH_CAMERAS = 16  # training cameras from which the nearest depth of each Gaussian is taken
 SUMMARY = "The well-lit scene as it moves, reconstructed from a dark video by l2dgs_jax."
 INFORMATION = """<p>{count:,} Gaussians, {still:,} of which keep still, at {keys} key instants. Here a Gaussian has one
 colour, the same from everywhere, where the model blends illumination and reflectance apart; and between key instants
@@ -34,12 +34,12 @@ all is interpolated. Against the model's own images, halfway between key instant
 
 
 def pixel_sizes(cameras: Camera, instants: list[tuple[Splats, ...]], nearest: float) -> Float[np.ndarray, " N"]:
-    """How much of the world, at each Gaussian, a pixel of the nearest camera spans; 0 where no camera sees it.
+    """For each Gaussian, the size of a pixel of the nearest camera at its depth, world units; 0 if none sees it.
 
     Args:
         cameras: F cameras.
         instants: the Gaussians at some instants.
-        nearest: depth from which on Gaussians are drawn, world units.
+        nearest: depth beyond which Gaussians are drawn, world units.
     """
     sizes = np.full(len(instants[0][0].means), np.inf)
     for i in range(0, len(cameras.time), max(len(cameras.time) // DEPTH_CAMERAS, 1)):
@@ -51,9 +51,9 @@ def pixel_sizes(cameras: Camera, instants: list[tuple[Splats, ...]], nearest: fl
 
 
 def compare(run: Run, tracks: Tracks) -> Float[np.ndarray, "T I"]:
-    """PSNR of what a page shows of each image against the exact ones, dB, halfway between some of the key instants."""
+    """PSNR of a page's images of each kind against the exact ones, dB, halfway between some of the key instants."""
     spans = len(tracks.moving.positions) - 1
-    times = (np.unique(np.linspace(0, spans - 1, CHECKS).round()) + 0.5) / spans
+    times = (np.unique(np.linspace(0, spans - 1, CHECKED_INSTANTS).round()) + 0.5) / spans
 
     def at_instant(time: float) -> list[float]:
         shown = zip(tracks_of.at(tracks, time), IMAGES, strict=True)
@@ -63,10 +63,10 @@ def compare(run: Run, tracks: Tracks) -> Float[np.ndarray, "T I"]:
 
 
 def page(run: Run, tracks: Tracks, scores: Float[np.ndarray, "T I"], seconds: float) -> str:
-    """The page.
+    """The page as HTML.
 
     Args:
-        run: what it shows.
+        run: the run that it shows.
         tracks: its Gaussians, in the colours of `IMAGES`.
         scores: see `compare`.
         seconds: how long the clip takes.
@@ -106,7 +106,7 @@ def _information(tracks: Tracks, scores: Float[np.ndarray, "T I"]) -> str:
 
 
 def _description(run: Run, tracks: Tracks, seconds: float) -> dict[str, Any]:
-    """What the player must know beside the tracks."""
+    """What the player needs besides the tracks, as JSON values."""
     dataset, cameras = run.dataset, run.dataset.train.cameras
     try:
         depth = median_depth(cameras, tracks_of.at(tracks, 0.5)[0].means)
@@ -149,7 +149,7 @@ def _description(run: Run, tracks: Tracks, seconds: float) -> dict[str, Any]:
 
 
 def _rounded(values: Any) -> Any:
-    """To what single precision holds, as lists."""
+    """Values rounded to the digits that single precision holds, as lists."""
     array = np.asarray(values, np.float64)
     texts = np.array([float(f"{value:.8g}") for value in array.ravel()])
     return texts.reshape(array.shape).tolist()

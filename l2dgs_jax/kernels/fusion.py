@@ -1,4 +1,4 @@
-"""Long arithmetic divided into parts that a CPU's compiler keeps apart."""
+"""Boundaries that keep XLA's CPU compiler from fusing long arithmetic into one piece."""
 
 from collections.abc import Callable
 from typing import Any, TypeVar
@@ -14,10 +14,10 @@ T = TypeVar("T")
 
 
 def unfused_on_cpu(function: Callable[..., T], like: Any = None) -> Callable[..., T]:
-    """The same function, on CPU not fused with what calls it (see `unfused`). Without gradients of its own.
+    """The same function, not fused with its caller on CPU (see `unfused`). It has no gradient.
 
     Args:
-        function: of PyTrees of arrays.
+        function: takes and returns PyTrees of arrays.
         like: shapes and types of its result, if they are known.
     """
 
@@ -29,11 +29,11 @@ def unfused_on_cpu(function: Callable[..., T], like: Any = None) -> Callable[...
 
 
 def fusion_boundary(function: Callable[..., T]) -> Callable[..., T]:
-    """The same function of floats; on CPU it is kept apart, and so is its gradient, computed from the arguments.
+    """The same function of floats; on CPU, neither it nor its gradient is fused with the code around it.
 
-    For long arithmetic with many results: divided by such boundaries, little of it is computed more than once. With a
-    boundary, gradients are reverse mode only. Where jax's default backend is no CPU, or a form other than "cpu" is set,
-    it is the function itself.
+    For long arithmetic with many results: divided by such boundaries, little of it is computed more than once. The
+    gradient is recomputed from the arguments, in reverse mode only. Where jax's default backend is not a CPU, or a form
+    other than "cpu" is set, the result is the function itself.
     """
 
     @jax.custom_vjp
@@ -58,8 +58,8 @@ def fusion_boundary(function: Callable[..., T]) -> Callable[..., T]:
 def repeat_channels(x: Float[Array, "*S"], channels: int) -> Float[Array, "*S C"]:
     """`x` repeated along a new last axis; carries gradients.
 
-    A matrix product, not a broadcast, because of its transpose: a sum over a few channels is slow on CPU. "highest"
-    keeps the values exact where products round their factors.
+    It is a matrix product because the transpose of a broadcast, a sum over a few channels, is slow on CPU. Precision
+    "highest" keeps the values exact on devices whose matrix products round their factors.
     """
     ones = jnp.ones((1, channels), x.dtype)
     return jnp.matmul(x.reshape(-1, 1), ones, precision="highest").reshape(*x.shape, channels)

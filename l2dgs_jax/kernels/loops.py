@@ -1,4 +1,4 @@
-"""Reading and writing of arrays inside of loops, by operations that XLA performs in place."""
+"""Reading and writing array elements inside loops, by operations that XLA performs in place."""
 
 from collections.abc import Callable
 from typing import TypeVar
@@ -12,7 +12,7 @@ Index = Int[Array, ""]
 
 
 def loop(steps: int | Index, body: Callable[[Index, T], T], state: T, first: int | Index = 0) -> T:
-    """`body(i, state)` for i from `first` to `steps` - 1; counters stay 32 bits wide where other integers are 64."""
+    """`body(i, state)` for i from `first` to `steps` - 1; counters have 32 bits even where other integers have 64."""
     return jax.lax.fori_loop(jnp.int32(first), jnp.int32(steps), body, state)
 
 

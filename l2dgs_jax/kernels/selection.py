@@ -1,4 +1,4 @@
-"""Which form of an operation runs: an explicit setting first, else what suits the platform that it is lowered for."""
+"""Which form of an operation runs: the one that is set explicitly, or else the one for the platform of the program."""
 
 import contextlib
 import functools
@@ -13,22 +13,22 @@ from jax.extend.core import Primitive
 from jax.interpreters import batching, mlir
 
 from l2dgs_jax.errors import UserError
-from l2dgs_jax.kernels.compilation import TRIED, VERSION
+from l2dgs_jax.kernels.compilation import TESTED, VERSION
 
 Form = Literal["reference", "cpu", "accelerator"]
 FORMS: tuple[Form, ...] = get_args(Form)
-VARIABLE = "L2DGS_JAX_KERNELS"  # of the environment: the form of a whole process
+ENV_VARIABLE = "L2DGS_JAX_KERNELS"  # sets the form for a whole process
 
 T = TypeVar("T")
 
 
-# Part of the key under which jax caches what it has traced and compiled.
+# A user context is part of the key under which jax caches traced and compiled functions.
 _UNSET = "unset"
 _setting = jax.make_user_context(default_value=_UNSET)
 
 
 def use_kernels(form: str | None) -> contextlib.AbstractContextManager[None]:
-    """A context in which every operation takes this form, whatever it is compiled for; None: the platform decides.
+    """A context in which every operation runs in this form, whatever the platform; None: the platform decides.
 
     The environment variable L2DGS_JAX_KERNELS sets the same for a whole process.
 
@@ -44,26 +44,26 @@ def use_kernels(form: str | None) -> contextlib.AbstractContextManager[None]:
 
 
 def chosen_form() -> Form | None:
-    """The explicit setting, if there is one.
+    """The form that is set explicitly, by `use_kernels` or the environment variable; None if there is none.
 
     Raises:
-        UserError: the environment names another form.
+        UserError: the environment variable names no form.
     """
     return _from_environment() if _setting.value == _UNSET else _setting.value
 
 
 @functools.cache
 def _from_environment() -> Form | None:
-    value = os.environ.get(VARIABLE) or None
+    value = os.environ.get(ENV_VARIABLE) or None
     if value not in (None, *FORMS):
-        raise UserError(f"{VARIABLE} is {value!r}; expected one of {', '.join(FORMS)}, or nothing")
+        raise UserError(f"{ENV_VARIABLE} is {value!r}; expected one of {', '.join(FORMS)}, or nothing")
     return value
 
 
 def functions_by_form(
     name: str, *, reference: Any, cpu: Any, accelerator: Any, **static: Any
 ) -> dict[str, Callable[..., Any]]:
-    """The functions of one name in the modules of the forms, for `by_form`, given what is fixed at compilation."""
+    """Arguments for `by_form`: the function `name` of each form's module, with `static` keyword arguments bound."""
     modules = {"reference": reference, "cpu": cpu, "accelerator": accelerator}
     return {form: functools.partial(getattr(module, name), **static) for form, module in modules.items()}
 
@@ -71,11 +71,11 @@ def functions_by_form(
 def by_form(
     *arguments: Any, reference: Callable[..., T], cpu: Callable[..., T], accelerator: Callable[..., T], like: Any
 ) -> T:
-    """One of three functions of the same values, called with the arguments.
+    """Call one of three functions that compute the same values.
 
-    Without an explicit setting nothing is traced before it is known which platform the program is lowered for:
-    programs for a CPU contain `cpu`, if this compiler was tried with it, and all others `accelerator`. Carries no
-    gradients then: callers define their own. Not for `jax.shard_map` that checks what varies over a mesh.
+    Without an explicit setting, the choice is made when the program is lowered for a platform: programs for CPUs
+    contain `cpu`, if it was tested with this version of the compiler, and all others `accelerator`. The call then
+    carries no gradients, so callers define their own, and cannot be used in a `jax.shard_map` with `check_vma`.
 
     Args:
         *arguments: PyTrees of arrays.
@@ -89,7 +89,7 @@ def by_form(
         return {"reference": reference, "cpu": cpu, "accelerator": accelerator}[form](*arguments)
     leaves, structure = jax.tree.flatten(arguments)
     shapes, result = jax.tree.flatten(like)
-    # Cotangents of integers are no arrays that a program could take.
+    # Cotangents of integers have type float0, which a program cannot take as an argument.
     nothing = jax.dtypes.float0
     constants = [np.zeros(leaf.shape, nothing) if leaf.dtype == nothing else None for leaf in leaves]
 
@@ -166,14 +166,14 @@ mlir.register_lowering(_by_platform, _lower_for_cpu, platform="cpu")
 
 
 def _for_cpu(cpu: Callable, accelerator: Callable) -> Callable:
-    if TRIED:
+    if TESTED:
         return cpu
-    _warn_of_untried_compiler()
+    _warn_of_untested_compiler()
     return accelerator
 
 
 @functools.cache
-def _warn_of_untried_compiler() -> None:
+def _warn_of_untested_compiler() -> None:
     warnings.warn(
         f"jaxlib {VERSION} was not tried with the fast kernels for CPUs, so this runs several times as slowly as it "
         "could; expected jaxlib 0.10",

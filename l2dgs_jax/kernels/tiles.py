@@ -1,17 +1,17 @@
-"""What the operations of the rasterizer agree on: tiles, lists, and thresholds."""
+"""What the kernels of the rasterizer share: tiles, lists, and thresholds."""
 
 from typing import NamedTuple
 
 from jaxtyping import Array, Int
 
-TILE = 8  # pixels, each way
-MIN_ALPHA = 1 / 255  # fainter contributions are skipped
+TILE_SIZE = 8  # pixels along each side
+MIN_ALPHA = 1 / 255  # contributions below are skipped
 MAX_ALPHA = 0.999
-MIN_TRANSMITTANCE = 1e-4  # a Gaussian that would leave this little light ends its pixel and is left out
+MIN_TRANSMITTANCE = 1e-4  # the Gaussian that would lower it to this or less ends the pixel and is itself left out
 
 
 class Tiling(NamedTuple):
-    """Sizes of a list of pairs: views, columns and rows of tiles in each, and how many pairs it can hold."""
+    """Sizes of a list of (Gaussian, tile) pairs: views, columns and rows of tiles in each, and pairs it can hold."""
 
     views: int
     columns: int
@@ -24,8 +24,8 @@ class TileLists(NamedTuple):
 
     Attributes:
         gaussians: flat indices (view * N + n), the lists one after the other.
-        starts: where each tile's list starts.
-        stops: where it ends.
+        starts: index of the first entry of each tile's list.
+        stops: index after its last entry.
     """
 
     gaussians: Int[Array, "*B M"]
@@ -35,4 +35,4 @@ class TileLists(NamedTuple):
 
 def grid(width: int, height: int) -> tuple[int, int]:
     """Columns and rows of tiles that cover an image."""
-    return -(-width // TILE), -(-height // TILE)
+    return -(-width // TILE_SIZE), -(-height // TILE_SIZE)

@@ -1,4 +1,4 @@
-"""Image quality: how alike images are, whole and by region, and what is left of an error after the best gain."""
+"""Image quality: similarity of images, whole and by region, and the gain that best corrects brightness."""
 
 from l2dgs_jax.metrics.gain import best_gain
 from l2dgs_jax.metrics.images import partial_ssim, psnr, ssim, ssim_map

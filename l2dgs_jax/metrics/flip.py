@@ -1,4 +1,4 @@
-"""FLIP: how different two images look to somebody who flips between them on a screen.
+"""FLIP: how different two images look to a viewer who alternates between them on a screen.
 
 Source: Andersson et al., "FLIP: A Difference Evaluator for Alternating Images" (HPG 2020), the low dynamic range form.
 """
@@ -18,8 +18,8 @@ _SENSITIVITIES = (((1.0, 0.0047),), ((1.0, 0.0053),), ((34.1, 0.04), (13.5, 0.02
 _WIDEST = 0.04
 _FEATURE_WIDTH = 0.082  # degrees
 _COLOR_POWER, _FEATURE_POWER = 0.7, 0.5
-_KNEE, _AT_KNEE = 0.4, 0.95  # this part of the largest difference of colour becomes that error
-_TO_XYZ = np.array(  # linear sRGB, exact fractions of its primaries and of D65
+_KNEE, _AT_KNEE = 0.4, 0.95  # that part of the largest colour difference is mapped to that error
+_TO_XYZ = np.array(  # from linear sRGB; exact fractions, derived from its primaries and D65
     [
         [10135552 / 24577794, 8788810 / 24577794, 4435075 / 24577794],
         [2613072 / 12288897, 8788810 / 12288897, 887015 / 12288897],
@@ -34,20 +34,20 @@ Pixels = Float32[np.ndarray, "*S 3"]
 
 
 def flip_map(prediction: Float[np.ndarray, "H W 3"], truth: Float[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "H W"]:
-    """The difference that is seen at each pixel, in [0, 1], at `PIXELS_PER_DEGREE`.
+    """The perceived difference at each pixel, in [0, 1], for a screen of `PIXELS_PER_DEGREE`.
 
     Args:
         prediction: sRGB values in [0, 1].
-        truth: likewise.
+        truth: sRGB values in [0, 1].
     """
     opponents = [_opponents(srgb_to_linear(np.asarray(image, np.float32))) for image in (prediction, truth)]
     return _color_error(*opponents) ** (1 - _feature_error(*opponents))
 
 
 def _color_error(*opponents: Float32[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "H W"]:
-    """HyAB distance of what the eye resolves, raised to a power and bent so that small differences count for most."""
+    """HyAB distance of the images as the eye resolves them, remapped so that small differences count most."""
     first, second = (_hunt_lab(np.clip(_from_opponents(_blurred(image)), 0, 1)) for image in opponents)
-    green, blue = _hunt_lab(np.eye(3, dtype=np.float32)[1:])[:, None]  # no two colours are farther apart
+    green, blue = _hunt_lab(np.eye(3, dtype=np.float32)[1:])[:, None]  # the two colours that differ most
     largest = _hyab(green, blue).item()
     error, knee = _hyab(first, second) ** _COLOR_POWER, _KNEE * largest**_COLOR_POWER
     beyond = (error - knee) / (largest**_COLOR_POWER - knee)
@@ -55,7 +55,7 @@ def _color_error(*opponents: Float32[np.ndarray, "H W 3"]) -> Float32[np.ndarray
 
 
 def _feature_error(*opponents: Float32[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "H W"]:
-    """How much edges or points, whichever differ more, are stronger in one image than in the other."""
+    """Difference in the strength of edges or of points, whichever is larger."""
     deviation = 0.5 * _FEATURE_WIDTH * PIXELS_PER_DEGREE
     x, y = _offsets(int(np.ceil(3 * deviation)))
     gaussian = np.exp(-(x**2 + y**2) / (2 * deviation**2))
@@ -69,7 +69,7 @@ def _feature_error(*opponents: Float32[np.ndarray, "H W 3"]) -> Float32[np.ndarr
 
 
 def _blurred(opponents: Float32[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "H W 3"]:
-    """What is left of an image's three channels at the distance that it is seen from."""
+    """The image's three channels after the eye's contrast sensitivity at the viewing distance."""
     x, y = _offsets(int(np.ceil(3 * np.sqrt(_WIDEST / (2 * np.pi**2)) * PIXELS_PER_DEGREE)))
     square = (x**2 + y**2) / PIXELS_PER_DEGREE**2
     channels = []
@@ -89,7 +89,7 @@ def _offsets(radius: int) -> tuple[Float[np.ndarray, "1 k"], Float[np.ndarray, "
 
 
 def _opponents(linear: Pixels) -> Pixels:
-    """YCxCz, CIELAB without its cube root, of linear sRGB."""
+    """YCxCz of linear sRGB: like CIELAB, but without the cube root."""
     x, y, z = np.moveaxis(linear @ _TO_XYZ.T / _WHITE, -1, 0)
     return np.stack([116 * y - 16, 500 * (x - y), 200 * (y - z)], -1)
 
@@ -100,7 +100,7 @@ def _from_opponents(opponents: Pixels) -> Pixels:
 
 
 def _hunt_lab(linear: Pixels) -> Pixels:
-    """CIELAB in which dark colours are less colourful, as the eye finds them (the Hunt effect)."""
+    """CIELAB of linear sRGB, adjusted so that dark colours are less colourful, as they appear (the Hunt effect)."""
     ratio = linear @ _TO_XYZ.T / _WHITE
     edge = 6 / 29
     root = np.where(ratio > edge**3, np.cbrt(ratio), ratio / (3 * edge**2) + 4 / 29)

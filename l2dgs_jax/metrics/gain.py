@@ -1,21 +1,22 @@
-"""The factor that an image's brightness is off by."""
+"""The global gain that best matches predicted images to the ground truth."""
 
 from collections.abc import Iterable
 
 import numpy as np
 from jaxtyping import Float
 
-LEVELS = 2**14  # of a prediction, which decide where it saturates
+LEVELS = 2**14  # to which predictions are rounded to find where they saturate
 
 
 def best_gain(frames: Iterable[tuple[Float[np.ndarray, "..."], Float[np.ndarray, "..."]]]) -> float:
-    """The one factor g >= 0 that minimises the mean of (min(g p, 1) - t)^2; 1 if every prediction is 0, NaN if one is.
+    """The factor g >= 0 that minimises the mean of (min(g p, 1) - t)^2; 1 if all predictions are 0, NaN if one is NaN.
 
-    Saturated values stop to count against a larger factor, as they do to the eye. Between the factors at which one more
-    value saturates the error is a parabola, so its least value is found exactly, but for values rounded to `LEVELS`.
+    A saturated value does not count against a larger factor, just as the eye does not notice it. Between the factors
+    at which one more value saturates, the error is a parabola, so its minimum is found exactly, except that predictions
+    are rounded to `LEVELS`.
 
     Args:
-        frames: predictions p and truths t, in [0, 1].
+        frames: predictions p and ground truths t, in [0, 1].
     """
     square, product, beyond = np.zeros((3, LEVELS))  # sums of p^2, p t and 1 - 2 t, over the values of a level
     for prediction, truth in frames:
@@ -28,7 +29,8 @@ def best_gain(frames: Iterable[tuple[Float[np.ndarray, "..."], Float[np.ndarray,
         beyond += np.bincount(level, 1 - 2 * t, LEVELS)
     if not square.any():
         return 1.0
-    # With levels up to the k-th below saturation, g lies between 1 / (its upper end) and that of the next.
+    # If the levels up to the k-th do not saturate and the next one does, g lies between the inverses of the upper ends
+    # of these two levels.
     below_square, below_product = np.cumsum(square), np.cumsum(product)
     saturated = beyond.sum() - np.cumsum(beyond)
     upper = LEVELS / np.arange(1, LEVELS + 1)

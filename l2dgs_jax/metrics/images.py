@@ -15,7 +15,7 @@ WINDOW = np.exp(-0.5 * (np.arange(-RADIUS, RADIUS + 1) / SIGMA) ** 2)
 WINDOW /= WINDOW.sum()
 C1, C2 = 0.01**2, 0.03**2  # for values in [0, 1]
 
-NO_VALUE = -np.inf  # in maps of local values; NaN is left for what went wrong
+NO_VALUE = -np.inf  # in maps of local values where there is none; NaN means that a computation failed
 
 Border = Literal["zero", "mirror"]
 
@@ -30,13 +30,13 @@ def ssim_map(
     Args:
         a: image with values in [0, 1].
         b: image with values in [0, 1].
-        border: what windows see beyond the image: "zero" (3D Gaussian Splatting's loss) or the image mirrored
-            about its edge (scikit-image).
+        border: padding of the images: with zeros ("zero", as in 3D Gaussian Splatting's loss) or mirrored about the
+            edge ("mirror", as in scikit-image).
     """
     if border == "mirror":
         edges = [(0, 0)] * (a.ndim - 3) + [(RADIUS, RADIUS)] * 2 + [(0, 0)]
         a, b = (jnp.pad(image, edges, "symmetric") for image in (a, b))
-    # Only the sum of the two variances enters SSIM: four blurred images do instead of five.
+    # Only the sum of the two variances enters SSIM, so that four blurred images suffice instead of five.
     mean_a, mean_b, square, product = map(_blur, (a, b, a * a + b * b, a * b))
     means = mean_a * mean_b
     mean_squares = mean_a * mean_a + mean_b * mean_b
@@ -47,7 +47,7 @@ def ssim_map(
 
 
 def ssim(a: Float[Array, "*B H W C"], b: Float[Array, "*B H W C"]) -> Float[Array, "*B"]:
-    """Mean SSIM over the windows that lie inside the image, as scikit-image; over all if the image has none."""
+    """Mean SSIM over the windows that lie inside the image, as in scikit-image; over all windows if none does."""
     similarity = ssim_map(a, b, "mirror")
     height, width = a.shape[-3:-1]
     if min(height, width) > 2 * RADIUS:
@@ -56,18 +56,18 @@ def ssim(a: Float[Array, "*B H W C"], b: Float[Array, "*B H W C"]) -> Float[Arra
 
 
 def inside(windows: Float[np.ndarray, "H W C"]) -> Float[np.ndarray, "H W C"]:
-    """A copy of what windows around the pixels yield, without value where they leave the image."""
+    """A copy of a map of window values, with `NO_VALUE` where the window around a pixel extends beyond the image."""
     kept = np.full_like(windows, NO_VALUE)
     kept[RADIUS:-RADIUS, RADIUS:-RADIUS] = windows[RADIUS:-RADIUS, RADIUS:-RADIUS]
     return kept
 
 
 def partial_ssim(a: Float[Array, "H W C"], b: Float[Array, "H W C"], mask: Bool[Array, "H W"]) -> Float[Array, ""]:
-    """Mean SSIM over the windows inside the image, of which each sees only its pixels in a mask: DyCheck's mSSIM.
+    """DyCheck's mSSIM: mean SSIM over the windows inside the image, each of which uses only its pixels in a mask.
 
     Source: arXiv 2210.13445 and its code. Sums along a window's side are scaled by its length over the number of pixels
-    that it sees, whatever their weights; windows that see nothing count as equal. For an image without a window inside,
-    the mean of its SSIM map over the mask.
+    in the mask, whatever their weights. In windows without any such pixel the images count as equal. If the image is
+    too small for a window, the result is the mean of its SSIM map over the mask.
     """
     if min(a.shape[:2]) <= 2 * RADIUS:
         return _masked_mean(ssim_map(a, b, "mirror"), mask)
@@ -97,7 +97,7 @@ def partial_ssim(a: Float[Array, "H W C"], b: Float[Array, "H W C"], mask: Bool[
 def psnr(
     a: Float[Array, "*B H W C"], b: Float[Array, "*B H W C"], mask: Bool[Array, "*B H W"] | None = None
 ) -> Float[Array, "*B"]:
-    """Peak signal to noise ratio in dB for values in [0, 1], of the pixels in `mask` (mPSNR, arXiv 2210.13445).
+    """Peak signal-to-noise ratio, dB, for values in [0, 1]; with `mask`, of its pixels (mPSNR, arXiv 2210.13445).
 
     Infinite for equal images, NaN where the mask is empty. Gradients flow to both images.
     """
@@ -111,7 +111,7 @@ def _masked_mean(values: Float[Array, "*B H W C"], mask: Bool[Array, "*B H W"]) 
 
 
 def _window_mean(images: Float[Array, "*B H W C"]) -> Float[Array, "*B H W C"]:
-    """The mean in a Gaussian window around each pixel, zeros beyond the image."""
+    """The mean in a Gaussian window around each pixel, with zeros beyond the image."""
 
     def along(axis: int, x: Float[Array, "*B H W C"]) -> Float[Array, "*B H W C"]:
         padded = jnp.pad(x, [(RADIUS, RADIUS) if k == x.ndim + axis else (0, 0) for k in range(x.ndim)])
@@ -122,5 +122,5 @@ def _window_mean(images: Float[Array, "*B H W C"]) -> Float[Array, "*B H W C"]:
 
 
 _blur = jax.custom_vjp(unfused_on_cpu(_window_mean))
-# A symmetric window is its own transpose; the transpose of slices would be a slow sum of padded images.
+# The blur with a symmetric window is its own transpose; JAX would derive a slow sum of padded images instead.
 _blur.defvjp(lambda images: (_blur(images), None), lambda _, cotangent: (_blur(cotangent),))

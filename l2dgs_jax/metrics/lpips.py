@@ -1,4 +1,4 @@
-"""LPIPS (arXiv 1801.03924, version 0.1): how differently a network for image recognition sees two images."""
+"""LPIPS (arXiv 1801.03924, version 0.1): distance of two images in the features of an image-recognition network."""
 
 from collections.abc import Sequence
 from typing import Literal, NamedTuple
@@ -19,14 +19,14 @@ class Layer(NamedTuple):
     """A convolution with ReLU.
 
     Attributes:
-        place: in torchvision's `features`.
+        place: its index in torchvision's `features`.
         size: of the kernel.
-        inputs: channels.
-        outputs: channels.
+        inputs: number of input channels.
+        outputs: number of output channels.
         stride: pixels.
         padding: pixels of zeros around the image.
-        pool: window of the maximum, taken at every other pixel, before it; 0 for none.
-        compared: whether its outputs are.
+        pool: window of the max pooling with stride 2 before it; 0 for none.
+        compared: whether LPIPS compares its outputs.
     """
 
     place: int
@@ -63,7 +63,7 @@ NETWORKS: dict[Network, tuple[Layer, ...]] = {
         Layer(28, 3, 512, 512),
     ),
 }
-SMALLEST: dict[Network, int] = {"alex": 31, "vgg": 16}  # side of an image, pixels, of which the last layer sees any
+SMALLEST_SIDE: dict[Network, int] = {"alex": 31, "vgg": 16}  # of an image, pixels, for the last layer to have outputs
 
 
 class Lpips(NamedTuple):
@@ -71,7 +71,7 @@ class Lpips(NamedTuple):
 
     Attributes:
         convs: of its layers.
-        heads: what the channels of the layers that are compared count.
+        heads: weights of the channels of those layers that are compared.
     """
 
     convs: tuple[Conv, ...]
@@ -81,13 +81,13 @@ class Lpips(NamedTuple):
 def lpips_maps(
     network: Network, weights: Lpips, a: Float[Array, "H W 3"], b: Float[Array, "H W 3"]
 ) -> list[Float[Array, "_ _"]]:
-    """The difference that each layer sees, at its own resolution; LPIPS is the sum of their means.
+    """For each compared layer, a map of the differences of its outputs; LPIPS is the sum of the maps' means.
 
     Args:
         network: which one.
         weights: of `NETWORKS[network]`.
-        a: image with values in [0, 1], which are brought to the [-1, 1] that LPIPS is made for.
-        b: likewise.
+        a: image with values in [0, 1], which are scaled to the [-1, 1] that LPIPS was made for.
+        b: image with values in [0, 1].
     """
     x = (2 * jnp.stack([a, b]) - 1 - _row(_SHIFT, a)) / _row(_SCALE, a)
     maps, heads = [], iter(weights.heads)

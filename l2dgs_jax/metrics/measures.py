@@ -1,4 +1,4 @@
-"""Measures of image quality, taken apart so that any part of an image can be scored by them."""
+"""Measures of image quality, split into local maps and a score, so that any region of an image can be scored."""
 
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -22,10 +22,10 @@ class Measure(NamedTuple):
     """A score made of means of local values.
 
     Attributes:
-        maps: local values of a prediction and the truth, at one resolution or more, or `NO_VALUE`.
-        score: what the means of the maps, one number a channel, amount to.
-        masked: how a mask is scored from images that show nothing else, if not as `Measure.maps` of such images.
-        spread: whether the convention "paper" gives a region the whole frame's score times its area.
+        maps: local values, or `NO_VALUE`, for a prediction and the ground truth, at one or more resolutions.
+        score: the score, given the mean of each map, one number per channel.
+        masked: the score of a mask's pixels alone; None if it is that of `maps` of images with all else set to black.
+        spread: whether by the convention "paper" a region's score is the whole frame's times its share of the area.
     """
 
     maps: Callable[[Pixels, Pixels], Maps]
@@ -35,18 +35,18 @@ class Measure(NamedTuple):
 
 
 def mean_score(maps: Maps, measure: Measure, mask: Mask) -> float:
-    """The score of the pixels in `mask`, resized to each map as its nearest; NaN if a map has no value there."""
+    """The score of the pixels in `mask`, resized to each map by nearest pixels; NaN if a map has no value there."""
     return measure.score([_mean(values, _nearest(mask, values.shape[:2])) for values in maps])
 
 
 def lpips_measure(network: lpips.Network, weights: lpips.Lpips | None) -> Measure:
-    """LPIPS by a network (arXiv 1801.03924), NaN without its weights.
+    """LPIPS with a network (arXiv 1801.03924); NaN without its weights.
 
-    "masked" it is the mean over the mask of maps enlarged to the image, as DyCheck's mLPIPS (arXiv 2210.13445).
+    Its `masked` form is the mean over the mask of maps enlarged to the image, as DyCheck's mLPIPS (arXiv 2210.13445).
     """
 
     def maps(a: Pixels, b: Pixels) -> Maps:
-        if weights is None or min(a.shape[:2]) < lpips.SMALLEST[network]:
+        if weights is None or min(a.shape[:2]) < lpips.SMALLEST_SIDE[network]:
             return [np.full((1, 1, 1), NO_VALUE)]
         return [np.asarray(x)[..., None] for x in _lpips_maps(network, weights, a, b)]
 

@@ -14,10 +14,10 @@ Pixels = Float[np.ndarray, "H W C"]
 
 
 def ms_ssim_maps(a: Pixels, b: Pixels) -> list[Float[np.ndarray, "_ _ C"]]:
-    """What each scale contributes around each of its pixels: contrast and structure, the last scale also luminance.
+    """For each scale, a map of its terms: contrast times structure, and at the last scale also luminance.
 
-    Every scale has half the rows and columns of the one before. Windows are those of `ssim`. Where they leave the image
-    the maps have no value, nor anywhere if the last scale has no window inside, below 161 pixels a side.
+    Every scale has half the rows and columns of the one before. Windows are those of `ssim`. The maps have no value
+    where windows extend beyond the image, and nowhere if no window of the last scale fits into it (below 161 pixels).
     """
     if min(a.shape[:2]) <= 2 * RADIUS * 2 ** (len(SCALE_WEIGHTS) - 1):
         return [np.full_like(a, NO_VALUE)] * len(SCALE_WEIGHTS)
@@ -34,7 +34,7 @@ def ms_ssim_maps(a: Pixels, b: Pixels) -> list[Float[np.ndarray, "_ _ C"]]:
 
 
 def pool(means: Sequence[Float[np.ndarray, " C"]]) -> float:
-    """MS-SSIM of the means of its maps, averaged over the channels; scales on which images are opposed count as 0."""
+    """MS-SSIM from the means of its maps, averaged over the channels; negative means count as 0."""
     return float(np.prod(np.maximum(means, 0) ** SCALE_WEIGHTS[:, None], axis=0).mean())
 
 

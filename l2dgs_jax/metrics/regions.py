@@ -1,4 +1,4 @@
-"""How the regions of a frame compare with the truth."""
+"""Scores of the regions of a frame against the ground truth."""
 
 from collections.abc import Mapping, Sequence
 from typing import Literal
@@ -30,20 +30,20 @@ def compare(
 
     Args:
         prediction: rendered image.
-        truth: what it should be.
+        truth: ground truth.
         dynamic: which pixels show something that moves.
-        valid: which pixels count; None for all. "overall" is then scored as "covisible" is.
+        valid: which pixels count; None for all. If some do not count, "overall" is scored by the convention "masked".
         covisible: which pixels enough training views have seen.
         measures: what to score, by name.
         convention: how "dynamic" and "static" are scored: "nsff", the mean of the whole frame's local values over the
-            region (arXiv 2011.13084); "masked", after all but the region was made black in both images, SSIM from its
-            pixels alone (DyCheck, arXiv 2210.13445); "paper", as "nsff" but for LPIPS, which is the whole frame's times
-            the region's part of it, as the figures of the L2DGS paper are.
+            region (arXiv 2011.13084); "masked", after all but the region is set to black in both images, and SSIM from
+            the region's pixels alone (DyCheck, arXiv 2210.13445); "paper", as "nsff" except for LPIPS, which is the
+            whole frame's times the region's share of the area, as in the L2DGS paper.
 
     Returns:
-        The scores of "overall", given `dynamic` of "dynamic" and "static", and given `covisible` of "covisible", always
-        "masked", those of them that have any pixel. None is a score that cannot be had of so few pixels, NaN one that
-        values which are not finite have spoiled; "area" is the region's part of the frame.
+        Scores by region: "overall"; with `dynamic` also "dynamic" and "static"; with `covisible` also "covisible",
+        always by the convention "masked". Regions without pixels are left out. A score is None if the region has too
+        few pixels for it, and NaN if values are not finite. "area" is the region's share of the frame.
     """
     prediction, truth = np.asarray(prediction), np.asarray(truth, prediction.dtype)
     masks = region_masks(prediction.shape[:2], dynamic, valid, covisible)
@@ -73,7 +73,7 @@ def compare(
 def region_masks(
     shape: tuple[int, int], dynamic: Mask | None, valid: Mask | None, covisible: Mask | None
 ) -> dict[str, Bool[np.ndarray, "H W"]]:
-    """The pixels of the regions that `compare` scores; it has the arguments."""
+    """Masks of the regions that `compare` scores; see there for the arguments."""
     counted = np.ones(shape, bool) if valid is None else np.asarray(valid)
     masks = {"overall": counted}
     if dynamic is not None:
@@ -84,7 +84,7 @@ def region_masks(
 
 
 def summarise(frames: Sequence[Mapping[str, Score]]) -> dict[str, Score]:
-    """Means per region and score, each over the frames that have it; None if no frame has, or if one of them is NaN."""
+    """Means per region and score over the frames that have the score; None if no frame has it or if one is NaN."""
     summary: dict[str, Score] = {}
     for region in dict.fromkeys(region for frame in frames for region in frame):
         scored = [frame[region] for frame in frames if region in frame]

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-LIT: Bool[np.ndarray, "6"] = np.arange(6) < 4  # the channels of L and R, which a background shows in
+HAS_BACKGROUND: Bool[np.ndarray, "6"] = np.arange(6) < 4  # the channels of L and R, which the background fills
 
 
 def pack(

@@ -1,4 +1,4 @@
-"""Some rows of arrays apart from the rest, and back again: gathers both ways, gradients included, in static shapes."""
+"""Selecting rows of arrays and putting them back: gathers both ways, gradients included, with static shapes."""
 
 from functools import partial
 from typing import NamedTuple
@@ -12,8 +12,8 @@ class Subset(NamedTuple):
     """M of N rows.
 
     Attributes:
-        rows: which they are, in their order.
-        places: of each of the N rows among them; M for one that is not.
+        rows: their indices, ascending.
+        places: for each of the N rows, its position in `rows`; M for rows outside the subset.
     """
 
     rows: Int[Array, " M"]
@@ -29,17 +29,17 @@ def highest(scores: Float[Array, " N"], count: int) -> Subset:
 
 @partial(jax.custom_vjp, nondiff_argnums=(2,))
 def select(values: Float[Array, "..."], subset: Subset, axis: int) -> Float[Array, "..."]:
-    """Those of N rows along an axis; `values` carry gradients."""
+    """The rows of the subset, out of N along an axis; `values` carry gradients."""
     return jnp.take(values, subset.rows, axis, mode="clip")
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(2,))
 def expand(values: Float[Array, "..."], subset: Subset, axis: int) -> Float[Array, "..."]:
-    """N rows along an axis of which M are given and the others 0; `values` carry gradients."""
+    """N rows along an axis: the M of the subset, which are given, and 0 elsewhere; `values` carry gradients."""
     return jnp.take(values, subset.places, axis, mode="fill", fill_value=0)
 
 
-# Each is the other's transpose. Derived from the gathers it would be a scatter, many times as slow on a CPU.
+# Each is the other's transpose. JAX would transpose the gathers into scatters, which are many times slower on a CPU.
 def _selected(values: Float[Array, "..."], subset: Subset, axis: int) -> tuple[Float[Array, "..."], Subset]:
     return select(values, subset, axis), subset
 

@@ -25,10 +25,10 @@ def decompose(features: Float[Array, "*B H W 6"], bafe: BAFENet, cfg: ModelConfi
 
     Returns:
         The images of Eqs. 5-9; a base of 0 stays 0 in the low-light image and passes no gradient to its exponent.
-        Without a decomposition both images are the blended colour, and L_w and the exponents are 1; `render` then puts
-        what a tone curve says in place of the low-light image.
+        Without the Retinex decomposition both images are the blended colour, and L_w and the exponents are 1; if
+        there are tone curves, `render` computes the low-light image by them instead.
     """
-    # Without a boundary the losses' gradient would be computed again for each of the channels.
+    # Without this boundary XLA would compute the losses' gradient again for each of the channels.
     illumination, reflectance, attenuation = fusion_boundary(channels.unpack)(features)
     illumination, reflectance = clip_unit(illumination), clip_unit(reflectance)
     if cfg.decomposition != "retinex":
@@ -57,19 +57,19 @@ def decompose(features: Float[Array, "*B H W 6"], bafe: BAFENet, cfg: ModelConfi
 
 
 def as_light(reflectance: Float[Array, "*S"], cfg: ModelConfig) -> Float[Array, "*S"]:
-    """What Eqs. 7 and 9 multiply and raise to a power: by `cfg.domain` R_w itself, or the light that it stands for."""
+    """R_w as Eqs. 7 and 9 use it: its sRGB values, or by `cfg.domain` the linear light that they encode."""
     return srgb_to_linear(reflectance) if cfg.domain == "light" else reflectance
 
 
 def product(light: Float[Array, "*B"], color: Float[Array, "*B 3"], cfg: ModelConfig) -> Float[Array, "*B 3"]:
-    """Light times colour, as `as_light` gives it, in sRGB values; both carry gradients where it is at most 1."""
+    """Light times colour (as `as_light` gives it), in sRGB values; both carry gradients where that is at most 1."""
     image = repeat_channels(light, 3) * color
     image = linear_to_srgb(image) if cfg.domain == "light" else image
     return clip_unit(image) if cfg.relative_light else image
 
 
 def full_light(cfg: ModelConfig) -> Float[Array, ""] | float:
-    """The L_w under which I_w is R_w: 1, or with `cfg.relative_light` what it starts from."""
+    """The L_w at which I_w equals R_w: 1, or with `cfg.relative_light` the initial L_w."""
     return cfg.initial_illumination if cfg.relative_light else 1.0  # type: ignore[return-value]  # "auto" is resolved
 
 

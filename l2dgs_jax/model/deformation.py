@@ -13,7 +13,7 @@ from l2dgs_jax.config import ModelConfig
 from l2dgs_jax.model import compaction, hexplane, networks, spherical_harmonics
 from l2dgs_jax.types import Camera, Gaussians, MovedGaussians, Scene
 
-FADING = 0.25  # time in which a Gaussian on a path comes or goes, over that between two control points
+FADE_DURATION = 0.25  # time in which a Gaussian on a path fades in or out, in spacings of the path's control points
 
 
 def deform(
@@ -24,7 +24,7 @@ def deform(
     moving: bool,
     sh_degree_active: Int[Array, ""] | int,
     presence: Float[Array, " N"] | None = None,
-    chances: Float[Array, " N"] | None = None,
+    gate_noise: Float[Array, " N"] | None = None,
 ) -> MovedGaussians:
     """Move and light every Gaussian for V cameras, each at its own instant.
 
@@ -37,14 +37,14 @@ def deform(
         moving: whether the motion field and OCD-Net act (fine stage); otherwise only paths do, with a_j = 1.
         sh_degree_active: bands of Eq. 2 above this one are left out; may be traced.
         presence: factor on the opacities, which stay at most 1; None for 1.
-        chances: added to the logits of the gates where these decide which Gaussians the motion field acts on
+        gate_noise: added to the logits of the gates, only to select the Gaussians that the motion field acts on
             (`cfg.moving_share`); None for 0.
 
     Returns:
         Activated Gaussians; every field has a leading axis V.
     """
     params, alive = scene.params, scene.alive
-    # Garbage in a dead row could overflow the exponential, and 0 * inf would reach the shared networks as NaN.
+    # Dead rows may hold any values: if exp overflowed on one, the gradient 0 * inf = NaN would reach shared networks.
     gaussians = jax.tree.map(
         lambda rows: jnp.where(alive.reshape(-1, *[1] * (rows.ndim - 1)), rows, 0), params.gaussians
     )
@@ -54,7 +54,7 @@ def deform(
     dc_and_rest = jnp.concatenate([gaussians.illumination_dc, gaussians.illumination_rest], axis=-1)
     coefficients = _active(dc_and_rest, cfg.sh_degree, sh_degree_active)[None]  # b_j of Eq. 2
     if moving:
-        changes = _changes(scene, gaussians, cameras, cfg, chances)
+        changes = _changes(scene, gaussians, cameras, cfg, gate_noise)
         means += length_unit(scene.extent, cfg) * changes.motion.means
         quats += changes.motion.quats
         log_scales += _growth(changes.motion.log_scales, cfg)
@@ -64,8 +64,8 @@ def deform(
             coefficients = (1 + changes.light) * coefficients
     opacities = jnp.where(alive[None], jax.nn.sigmoid(logit_opacities), 0)
     if gaussians.paths is not None and gaussians.lifetimes is not None:
-        displacements, there = _on_paths(gaussians.paths, gaussians.lifetimes, cameras.time)
-        means, opacities = means + displacements, there * opacities
+        displacements, visibility = _on_paths(gaussians.paths, gaussians.lifetimes, cameras.time)
+        means, opacities = means + displacements, visibility * opacities
     basis = _basis(gaussians.means, cameras.viewmat, cfg.sh_degree)
     reflectance = per_view(gaussians.reflectance)
     if gaussians.color_rest is not None:
@@ -92,10 +92,10 @@ def _changes(
     gaussians: Gaussians,
     cameras: Camera,
     cfg: ModelConfig,
-    chances: Float[Array, " N"] | None,
+    gate_noise: Float[Array, " N"] | None,
 ) -> _Changes:
-    """What the motion field does to every Gaussian."""
-    gate, subset = gaussians.gate, acting(scene, cfg, chances)
+    """What the motion field changes in every Gaussian."""
+    gate, subset = gaussians.gate, acting(scene, cfg, gate_noise)
     chosen = lambda rows: rows if subset is None else compaction.select(rows, subset, 0)
     # The same features feed the heads and OCD-Net: Eqs. 1 and 4 name them both f.
     field = hexplane.features(scene.params.hexplane, chosen(gaussians.means), scene.bounds, cameras.time, cfg)
@@ -108,49 +108,49 @@ def _changes(
 
 
 def _growth(log_scales: Float[Array, "V N 3"], cfg: ModelConfig) -> Float[Array, "V N 3"]:
-    """What is added to the logarithms of the scales for what their head says."""
+    """What is added to the log-scales for their head's output x: x, or log(1 + x) if growth is linear and x > 0."""
     if cfg.scale_growth == "exponential":
         return log_scales
     return jnp.log1p(jnp.maximum(log_scales, 0)) + jnp.minimum(log_scales, 0)
 
 
-def acting(scene: Scene, cfg: ModelConfig, chances: Float[Array, " N"] | None = None) -> compaction.Subset | None:
-    """The Gaussians that the motion field acts on; None for all. For `chances` see `deform`."""
+def acting(scene: Scene, cfg: ModelConfig, gate_noise: Float[Array, " N"] | None = None) -> compaction.Subset | None:
+    """The Gaussians that the motion field acts on; None for all. For `gate_noise` see `deform`."""
     gate = scene.params.gaussians.gate
     if gate is None or cfg.moving_share == 1:
         return None
-    scores = gate if chances is None else gate + chances
+    scores = gate if gate_noise is None else gate + gate_noise
     return compaction.highest(jnp.where(scene.alive, scores, -jnp.inf), math.ceil(cfg.moving_share * len(gate)))
 
 
 def _on_paths(
     paths: Float[Array, "N K 3"], lifetimes: Float[Array, "N 2"], times: Float[Array, " V"]
 ) -> tuple[Float[Array, "V N 3"], Float[Array, "V N"]]:
-    """Where Gaussians are on their paths, and how much of them is there.
+    """Displacements of Gaussians along their paths, and the factors by which lifetimes scale their opacities.
 
-    A Gaussian comes and goes within a part of the time between two control points of its path. Gradients flow to all
-    arguments; Gaussians of infinite lifetime are where they are, always.
+    Outside its lifetime a Gaussian fades within `FADE_DURATION`. Gradients flow to all arguments; Gaussians of infinite
+    lifetime have no path: they stay in place, with a factor of 1.
     """
     knots = paths.shape[1]
-    lives = jnp.isfinite(lifetimes).all(-1)
-    first, last = jnp.where(lives[:, None], lifetimes, 0).T
+    has_path = jnp.isfinite(lifetimes).all(-1)
+    first, last = jnp.where(has_path[:, None], lifetimes, 0).T
     outside = jnp.maximum(first[None] - times[:, None], times[:, None] - last[None])
-    there = jnp.clip(1 - (knots - 1) / FADING * outside, 0, 1)
-    displacements = jnp.einsum("vk,nkc->vnc", path_weights(times, knots), jnp.where(lives[:, None, None], paths, 0))
-    return displacements, jnp.where(lives[None], there, 1)
+    visibility = jnp.clip(1 - (knots - 1) / FADE_DURATION * outside, 0, 1)
+    displacements = jnp.einsum("vk,nkc->vnc", path_weights(times, knots), jnp.where(has_path[:, None, None], paths, 0))
+    return displacements, jnp.where(has_path[None], visibility, 1)
 
 
 def path_weights(times: Float[Array, " V"], knots: int) -> Float[Array, "V K"]:
     """Weights of a path's control points at instants in [0, 1]: a uniform cubic spline. Carries gradients."""
     position = jnp.clip(times, 0, 1) * (knots - 1)
-    apart = jnp.abs(position[:, None] - jnp.arange(knots, dtype=position.dtype)[None])
-    near, far = jnp.minimum(apart, 1), jnp.clip(2 - apart, 0, 1)
-    weights = jnp.where(apart < 1, 2 / 3 - near**2 + near**3 / 2, far**3 / 6)
-    return weights / weights.sum(-1, keepdims=True)  # at the ends some are missing
+    distance = jnp.abs(position[:, None] - jnp.arange(knots, dtype=position.dtype)[None])
+    near, far = jnp.minimum(distance, 1), jnp.clip(2 - distance, 0, 1)
+    weights = jnp.where(distance < 1, 2 / 3 - near**2 + near**3 / 2, far**3 / 6)
+    return weights / weights.sum(-1, keepdims=True)  # at both ends the spline reaches beyond the control points
 
 
 def length_unit(extent: Float[Array, ""] | float, cfg: ModelConfig) -> Float[Array, ""] | float:
-    """The length that motion, depths and scales of a scene of that extent are measured in, world units."""
+    """The unit of length of motion, depths and scales in a scene of that extent, world units."""
     return extent if cfg.unit == "depth" else 1.0
 
 
@@ -158,14 +158,14 @@ def _basis(means: Float[Array, "N 3"], viewmat: Float[Array, "V 4 4"], degree: i
     """The spherical harmonics of Eqs. 2 and 3 towards each Gaussian.
 
     The view direction is taken from the canonical mean: the coefficients belong to the Gaussian, so its motion alone
-    does not change how it is lit. What does change is OCD-Net's part.
+    does not change how it is lit; that is left to OCD-Net.
     """
     everywhere = jnp.broadcast_to(means[None], (len(viewmat), *means.shape))
     return spherical_harmonics.basis(spherical_harmonics.directions(everywhere, camera_centres(viewmat)), degree)
 
 
 def _active(coefficients: Float[Array, "*S J"], degree: int, active: Int[Array, ""] | int) -> Float[Array, "*S J"]:
-    """Coefficients of spherical harmonics, all or without the first, those of bands above `active` set to zero."""
+    """Coefficients of spherical harmonics (all, or all but the first) with bands above `active` set to zero."""
     bands = np.repeat(np.arange(degree + 1, dtype=np.int32), 2 * np.arange(degree + 1) + 1)
     used = bands[len(bands) - coefficients.shape[-1] :] <= jnp.asarray(active, jnp.int32)
     return jnp.where(used.reshape(*[1] * (coefficients.ndim - 1), -1), coefficients, 0)

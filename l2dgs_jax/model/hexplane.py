@@ -50,8 +50,8 @@ def features(
     """Features of every point at every time, before the aggregation g (Eq. 1).
 
     Bilinear, with the first and last cell at the ends of the box and of the time axis. Points outside the box take
-    the feature of the nearest point of it, or with `cfg.box_rim` those of cells of their own. Gradients flow to
-    `planes`, `points` (zero where they are clamped) and `times`, in reverse mode only.
+    the feature of the nearest point of it, or with `cfg.box_rim` are contracted into a rim of cells around it.
+    Gradients flow to `planes`, `points` (zero where they are clamped) and `times`, in reverse mode only.
 
     Args:
         planes: the six planes at each scale.
@@ -100,10 +100,10 @@ def regularisers(planes: HexPlane) -> tuple[Float[Array, ""], Float[Array, ""], 
 
 
 def _contract(unit: Float[Array, "*S"], rim: float) -> Float[Array, "*S"]:
-    """Coordinates of which [0, 1] is the box, all of space brought into [0, 1].
+    """Contract coordinates in which the box is [0, 1] so that all of space fits into [0, 1].
 
-    The box takes the middle 1 - `rim`, and what lies beyond the rest, ever more densely (as Mip-NeRF 360, arXiv
-    2111.12077, does); without a rim it is clamped.
+    The box takes the middle 1 - `rim`. Space beyond it fills the rest, compressed more and more with distance (as in
+    Mip-NeRF 360, arXiv 2111.12077); without a rim it is clamped to the box.
     """
     if not rim:
         return jnp.clip(unit, 0, 1)

@@ -1,4 +1,4 @@
-"""The scene that a training starts from: one Gaussian a point."""
+"""The scene that a training starts from: one Gaussian per point."""
 
 import dataclasses
 from functools import partial
@@ -20,18 +20,18 @@ from l2dgs_jax.types import Camera, Gaussians, Scene, SceneParams, ToneCurves
 
 SH_DC = 0.28209479177387814  # value of the first SH basis function
 LUMINANCE = np.array([0.2989, 0.587, 0.114])
-OPEN_GATE = 2.0  # logit of the factor on motion that every Gaussian starts with
-DEPTHS_PER_EXTENT = 0.25  # about the radius of a hand-held camera's path
-LEAST_SPACING = 1e-7**0.5  # of points, for the scales that Gaussians start with
-SEED_SCALE = 0.6  # of seeds, over their spacing
-MOST_KNOTS = 100  # of a path
+INITIAL_GATE = 2.0  # logit of the factor on motion that every Gaussian starts with
+EXTENT_PER_DEPTH = 0.25  # extent over median depth: about the radius of a hand-held camera's path
+MIN_SCALE = 1e-7**0.5  # lower bound on initial scales, in units of length (as 3DGS)
+SEED_SCALE = 0.6  # initial scale of seeds over their spacing
+MAX_KNOTS = 100  # control points of a path
 
 
 class Seeds(NamedTuple):
-    """S points to start from that have paths.
+    """S points on moving things to start Gaussians with paths from.
 
     Attributes:
-        points: where their Gaussians are, world units.
+        points: canonical centres of the Gaussians, world units.
         colors: in the dark frames, sRGB in [0, 1].
         spacings: how far they are from each other, world units.
         paths: as in `Gaussians`.
@@ -46,14 +46,14 @@ class Seeds(NamedTuple):
 
 
 def path_knots(num_frames: int) -> int:
-    """How many control points a path has: half as many as there are training frames, if these are not too many."""
-    return min(max(num_frames // 2, 4), MOST_KNOTS)
+    """How many control points a path has: half as many as there are training frames, but 4 to `MAX_KNOTS`."""
+    return min(max(num_frames // 2, 4), MAX_KNOTS)
 
 
 def z_order(points: np.ndarray) -> np.ndarray:
     """The order of points [P 3] along a Z-order curve (Morton, 1966).
 
-    What lies close in space then mostly lies close in memory, and looking up its features finds them in a cache.
+    What lies close in space then mostly lies close in memory, so that feature lookups hit the caches.
     """
     bits = 10
     low, span = points.min(0), max(float(np.ptp(points, axis=0).max()), 1e-30)
@@ -74,7 +74,7 @@ def initialise(
     seeds: Seeds | None = None,
     curve: np.ndarray | None = None,
 ) -> Scene:
-    """A scene with one Gaussian a point, and then one a seed, ready for training.
+    """A scene with one Gaussian per point, followed by one per seed, ready for training.
 
     Scales are the root mean square distance to the three nearest points, illumination the luminance of the point
     (mid-grey without colours) unless `cfg.initial_illumination` says otherwise, opacity `cfg.initial_opacity`,
@@ -94,12 +94,12 @@ def initialise(
     """
     distances, _ = cKDTree(points).query(points, k=min(4, len(points)))
     mean_square = np.square(distances[:, 1:]).mean(-1) if len(points) > 1 else np.ones(1)
-    extent = camera_extent(cameras) if cfg.unit == "world" else DEPTHS_PER_EXTENT * median_depth(cameras, points)
+    extent = camera_extent(cameras) if cfg.unit == "world" else EXTENT_PER_DEPTH * median_depth(cameras, points)
     paths = lifetimes = None
     if seeds is not None:
-        still = len(points)
-        paths = np.concatenate([np.zeros((still, *seeds.paths.shape[1:])), seeds.paths])
-        lifetimes = np.concatenate([np.tile([[-np.inf, np.inf]], (still, 1)), seeds.lifetimes])
+        num_static = len(points)
+        paths = np.concatenate([np.zeros((num_static, *seeds.paths.shape[1:])), seeds.paths])
+        lifetimes = np.concatenate([np.tile([[-np.inf, np.inf]], (num_static, 1)), seeds.lifetimes])
         mean_square = np.concatenate([mean_square, np.square(SEED_SCALE * seeds.spacings)])
         points = np.concatenate([points, seeds.points])
         colors = None if colors is None else np.concatenate([colors, seeds.colors])
@@ -109,12 +109,12 @@ def initialise(
     else:
         illumination = np.full(count, 0.5) if colors is None else np.asarray(colors) @ LUMINANCE
     bias = None if cfg.initial_exponents is None else networks.exponent_bias(cfg.initial_exponents)
-    least = LEAST_SPACING * length_unit(extent, cfg)
+    min_scale = MIN_SCALE * length_unit(extent, cfg)
     rim = (1 - cfg.box_points) / 2
     arrays: tuple = (
         points,
         np.quantile(points, [rim, 1 - rim], axis=0),
-        np.log(np.maximum(np.sqrt(mean_square), least)),
+        np.log(np.maximum(np.sqrt(mean_square), min_scale)),
         illumination - cfg.illumination_offset,
         np.full(count, logit(cfg.initial_opacity)),
         reflectance,
@@ -150,7 +150,7 @@ def scene_shapes(cfg: ModelConfig, num_frames: int) -> Scene:
 
 
 def _static_settings(cfg: ModelConfig) -> ModelConfig:
-    """The settings without those that are only numbers to start from: scenes that differ in them share a program."""
+    """The settings without mere initial values: scenes that differ only in these share a compiled program."""
     default = ModelConfig()
     return dataclasses.replace(
         cfg,
@@ -182,7 +182,7 @@ def _initialise(
     num_frames: int,
     capacity: int,
 ) -> Scene:
-    """See `initialise`; `illumination` is what the spherical harmonics are to give, their offset taken off."""
+    """See `initialise`; `illumination` is what the spherical harmonics are to give, without their offset."""
     count, num_rest = len(points), (cfg.sh_degree + 1) ** 2 - 1
     keys = jax.random.split(key, 6)
     random = {"normal": jax.random.normal, "uniform": jax.random.uniform}
@@ -195,7 +195,7 @@ def _initialise(
         illumination_rest=jnp.zeros((count, num_rest)),
         reflectance=random[cfg.reflectance_init](keys[0], (count, 3)) if reflectance is None else reflectance,
         attenuation=random[cfg.attenuation_init](keys[1], (count, 2)),
-        gate=jnp.full(count, OPEN_GATE, float) if cfg.motion_gate else None,
+        gate=jnp.full(count, INITIAL_GATE, float) if cfg.motion_gate else None,
         paths=paths,
         lifetimes=lifetimes,
         color_rest=jnp.zeros((count, 3, num_rest)) if cfg.decomposition != "retinex" else None,

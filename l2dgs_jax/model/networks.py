@@ -14,18 +14,18 @@ from l2dgs_jax.config import ModelConfig
 from l2dgs_jax.kernels.convolution import convolve
 from l2dgs_jax.types import BAFENet, Conv, GroupNorm, Linear, Motion, MotionHeads, OCDNet
 
-# B1 and B2 lie in the open interval CENTRE - REACH ... CENTRE + REACH.
+# B1 and B2 lie in the open interval EXPONENT_CENTRE -/+ EXPONENT_HALF_RANGE, which is (1, 10).
 EXPONENT_CENTRE = 5.5
-EXPONENT_REACH = 4.5
-LEAK = 0.01
+EXPONENT_HALF_RANGE = 4.5
+LEAKY_SLOPE = 0.01  # of leaky ReLU for negative values
 GROUP_NORM_EPS = 1e-5
-SKIP_GAIN = 0.3  # of BAFE-Net's first block where it rejoins the third
+SKIP_GAIN = 0.3  # factor on the skip connection from BAFE-Net's first block to its third
 
 
 def init_heads(key: PRNGKeyArray, feature_size: int, cfg: ModelConfig) -> MotionHeads:
     """The aggregation g of Eq. 1 and the mu, Q and S heads: Xavier-uniform weights, zero biases.
 
-    With `cfg.identity_start` the last layer of each head is zero: no motion, yet live gradients in that layer.
+    With `cfg.identity_start` the last layer of each head is zero: no motion, yet non-zero gradients in that layer.
 
     Args:
         key: randomness of the weights.
@@ -74,8 +74,8 @@ def apply_heads(heads: MotionHeads, features: Float[Array, "*B F"]) -> tuple[Flo
 def init_ocd(key: PRNGKeyArray, cfg: ModelConfig) -> OCDNet:
     """OCD-Net (Eq. 4): Xavier-uniform weights, zero biases.
 
-    With `cfg.identity_start` every a_j starts at exactly 1, on the live side of the last ReLU. Without, about half of
-    them start at 0 and the illumination jumps when OCD-Net joins.
+    With `cfg.identity_start` every a_j starts at exactly 1, where the last ReLU passes gradients. Without, about half
+    of them start at 0 and the illumination jumps when OCD-Net is switched on.
 
     Args:
         key: randomness of the weights.
@@ -101,8 +101,8 @@ def apply_ocd(ocd: OCDNet, hidden: Float[Array, "*B H"]) -> Float[Array, "*B J"]
 def init_bafe(key: PRNGKeyArray, exponent_bias: Float[Array, "2"] | None) -> BAFENet:
     """BAFE-Net: Xavier-uniform kernels, zero biases, exponents near 5.5.
 
-    With `exponent_bias` the last layer starts with it and a zero kernel, so that the exponents start there exactly; its
-    first step makes the kernel non-zero and the earlier layers begin to learn.
+    With `exponent_bias` the last layer starts with that bias and a zero kernel, so that the exponents start exactly at
+    the values it stands for; the first step makes the kernel non-zero, and the earlier layers begin to learn.
 
     Args:
         key: randomness of the kernels.
@@ -125,30 +125,29 @@ def init_bafe(key: PRNGKeyArray, exponent_bias: Float[Array, "2"] | None) -> BAF
 
 
 def exponent_bias(exponents: tuple[Any, Any]) -> Float[np.ndarray, "2"]:
-    """What BAFE-Net's last layer must give for B1 and B2 to come out.
+    """What BAFE-Net's last layer must give for these B1 and B2 to come out.
 
     Raises:
         ValueError: one of them is not a number strictly between 1 and 10.
     """
     for value in exponents:
-        if isinstance(value, str) or not abs(value - EXPONENT_CENTRE) < EXPONENT_REACH:
+        if isinstance(value, str) or not abs(value - EXPONENT_CENTRE) < EXPONENT_HALF_RANGE:
             raise ValueError(f"initial exponents must be numbers strictly between 1 and 10, not {value}")
-    sign = (np.array(exponents, float) - EXPONENT_CENTRE) / EXPONENT_REACH
-    return sign / (1 - np.abs(sign))
+    soft_sign = (np.array(exponents, float) - EXPONENT_CENTRE) / EXPONENT_HALF_RANGE
+    return soft_sign / (1 - np.abs(soft_sign))
 
 
 def apply_bafe(bafe: BAFENet, attenuation: Float[Array, "*B H W 2"]) -> Float[Array, "*B H W 2"]:
     """The exponents B1 and B2 of Eq. 9, each in (1, 10). Gradients flow to both arguments.
 
-    Normalisation uses the statistics of each whole image, so a crop of the input gives other exponents than a crop of
-    the output.
+    Normalisation uses the statistics of each whole image, so the exponents of a crop are not a crop of the exponents.
 
     Args:
         bafe: parameters.
         attenuation: the rasterized (b1, b2) of Eq. 8.
     """
     x = jnp.tanh(attenuation.reshape(-1, *attenuation.shape[-3:]))
-    leaky = lambda y: jax.nn.leaky_relu(y, LEAK)
+    leaky = lambda y: jax.nn.leaky_relu(y, LEAKY_SLOPE)
     first = leaky(_group_norm(bafe.norm1, apply_conv(bafe.conv1, x), 2))
     second = leaky(_group_norm(bafe.norm2, apply_conv(bafe.conv2, first), 4))
     third = leaky(_group_norm(bafe.norm3, apply_conv(bafe.conv3, second), 2) + SKIP_GAIN * first)
@@ -156,7 +155,7 @@ def apply_bafe(bafe: BAFENet, attenuation: Float[Array, "*B H W 2"]) -> Float[Ar
 
 
 def bounded_exponents(bafe: BAFENet, attenuation: Float[Array, "*B H W 2"]) -> Float[Array, "*B H W 2"]:
-    """Exponents in (1, 10) of the rasterized (b1, b2) alone: of BAFE-Net only the last bias, and the range, are left.
+    """Exponents in (1, 10) from the rasterized (b1, b2) alone: BAFE-Net reduced to its last bias and the range.
 
     Gradients flow to both arguments.
     """
@@ -164,7 +163,7 @@ def bounded_exponents(bafe: BAFENet, attenuation: Float[Array, "*B H W 2"]) -> F
 
 
 def _bound(x: Float[Array, "*S"]) -> Float[Array, "*S"]:
-    return EXPONENT_CENTRE + EXPONENT_REACH * jax.nn.soft_sign(x)
+    return EXPONENT_CENTRE + EXPONENT_HALF_RANGE * jax.nn.soft_sign(x)
 
 
 def _xavier(key: PRNGKeyArray, shape: tuple[int, ...], fan_in: int, fan_out: int) -> Float[Array, "..."]:
@@ -177,15 +176,15 @@ def _linear(key: PRNGKeyArray, inputs: int, outputs: int) -> Linear:
 
 
 def _affine(layer: Linear, x: Float[Array, "*B I"]) -> Float[Array, "*B O"]:
-    # The barrier keeps the weights' gradient as it is written, narrow times wide: XLA's CPU code takes several times as
-    # long for the same product turned around.
+    # The barrier makes XLA compute the weights' gradient as it is written, narrow times wide: on a CPU the transposed
+    # product takes several times as long.
     weight = jax.lax.optimization_barrier(layer.weight.T)
     flat = jax.lax.dot_general(x.reshape(-1, x.shape[-1]), weight, (((1,), (1,)), ((), ()))) + layer.bias[None]
     return flat.reshape(*x.shape[:-1], -1)
 
 
 def _elu(x: Float[Array, "*S"]) -> Float[Array, "*S"]:
-    # Not expm1, which takes three times as long and is no closer to the truth once 1 is near.
+    # Not expm1, which takes three times as long: the digits that it gains near 0 are lost beside values near 1.
     return jnp.where(x > 0, x, jnp.exp(jnp.minimum(x, 0)) - 1)
 
 
@@ -201,7 +200,7 @@ def apply_conv(layer: Conv, x: Float[Array, "B H W I"]) -> Float[Array, "B H W O
 
 
 def _group_norm(layer: GroupNorm, x: Float[Array, "B H W C"], groups: int) -> Float[Array, "B H W C"]:
-    """Zero mean and unit variance over each image and group of channels, then an affine map a channel."""
+    """Zero mean and unit variance over each image and group of channels, then an affine map per channel."""
 
     def pool(y: Float[Array, "B H W C"]) -> Float[Array, "B 1 1 C"]:
         # Pooling the pixels first keeps the channel axis whole; statistics over a split axis are much slower on CPU.

@@ -34,7 +34,7 @@ def render(
     pair_capacity: int | None,
     means2d_probe: Float[Array, "V N 2"] | None = None,
     presence: Float[Array, " N"] | None = None,
-    chances: Float[Array, " N"] | None = None,
+    gate_noise: Float[Array, " N"] | None = None,
 ) -> RenderOutput:
     """Render V views, each at its own instant (Eqs. 1-9).
 
@@ -51,9 +51,11 @@ def render(
         pair_capacity: size of the rasterizer's pair buffer for all views; None only outside jit.
         means2d_probe: zeros whose gradient is dL/d(mean2d) in pixels.
         presence: see `deform`.
-        chances: see `deform`.
+        gate_noise: see `deform`.
     """
-    moved = deform(scene, cameras, cfg, moving=moving, sh_degree_active=sh_degree, presence=presence, chances=chances)
+    moved = deform(
+        scene, cameras, cfg, moving=moving, sh_degree_active=sh_degree, presence=presence, gate_noise=gate_noise
+    )
     drawn = rasterize(
         moved.means,
         moved.quats,
@@ -70,8 +72,8 @@ def render(
     )
     features = drawn.features
     if cfg.background:
-        lit = channels.LIT[None, None, None]
-        features = features + cfg.background * jnp.where(lit, 1 - drawn.alpha[..., None], 0)
+        filled = channels.HAS_BACKGROUND[None, None, None]
+        features = features + cfg.background * jnp.where(filled, 1 - drawn.alpha[..., None], 0)
     images, curves = decompose(features, scene.params.bafe, cfg), scene.params.curves
     if curves is not None:
         shared = jnp.broadcast_to(curves.shared[None], (len(features), *curves.shared.shape))
@@ -96,15 +98,15 @@ class Renderer:
 
     def __call__(self, camera: Camera) -> RenderOutput:
         """Render one camera (no batch axis); the output has none either."""
-        output = self._fitting(_render, camera)
+        output = self._without_overflow(_render, camera)
         images = jax.tree.map(lambda x: x[0], output.images)
         return output._replace(images=images, alpha=output.alpha[0], depth=output.depth[0], radii=output.radii[0])
 
     def welllit(self, camera: Camera) -> Float[Array, "H W 3"]:
         """Only I_w of one camera: without the low-light image, no exponents are needed."""
-        return self._fitting(_render_welllit, camera).image[0]
+        return self._without_overflow(_render_welllit, camera).image[0]
 
-    def _fitting(self, draw: Callable[..., Drawn], camera: Camera) -> Drawn:
+    def _without_overflow(self, draw: Callable[..., Drawn], camera: Camera) -> Drawn:
         cameras = jax.tree.map(lambda x: jnp.asarray(x, float)[None], camera)
         while True:
             output = draw(

@@ -1,4 +1,4 @@
-"""What underexposure does to an sRGB image: where B1 and L_w start, and how bright the result is to be."""
+"""What underexposure does to sRGB images: the initial B1 and L_w, and how bright the result is to be."""
 
 from collections.abc import Iterator
 from typing import Literal, NamedTuple
@@ -11,21 +11,20 @@ from l2dgs_jax.data.color import linear_to_srgb, srgb_to_linear
 
 Tone = Literal["linear-light", "gain"]
 
-LEAST_EXPONENT, MOST_EXPONENT = 1.01, 2.0  # B1 can come close to 1, not reach it
-# Frames are clean if the smoothest of their windows deviate less than that from a plane, and flat if the log of their
-# grey values does so from its mean.
-CLEAN, FLAT = 1 / 255, 0.5
-SMOOTHEST = 0.1  # share of the windows
-WINDOW = 7  # pixels
-LOOKED_AT = 12  # frames
+MIN_EXPONENT, MAX_EXPONENT = 1.01, 2.0  # B1 can come close to 1, not reach it
+# Frames count as clean if a low quantile of their local noise is below a limit (texture looks like noise, so only the
+# smoothest windows tell), and as flat if the standard deviation of their log grey values is below another.
+NOISE_QUANTILE, MAX_CLEAN_NOISE, MAX_FLAT_CONTRAST = 0.1, 1 / 255, 0.5
+NOISE_WINDOW = 7  # side in pixels of the window that local noise is measured in
+SAMPLED_FRAMES = 12
 MID_GREY = 0.46  # photographers' middle grey, 18 % linear, in sRGB
-# Highlights, which all but some of the pixels stay below, shall stay below a value themselves. A lamp in view must not
-# leave all else in the dark: the level gives way by no more than a stop.
-HIGHLIGHTS, BRIGHTEST, MOST_GIVEN_WAY = 0.98, 0.9, 0.5
+# The level is lowered until the brightened highlights, a high quantile of the pixels, do not exceed a value; but only
+# down to a part of itself, as a lamp in view must not leave all else in the dark.
+HIGHLIGHT_QUANTILE, MAX_HIGHLIGHTS, MIN_LEVEL_FACTOR = 0.98, 0.9, 0.5
 
 
 class Darkening(NamedTuple):
-    """An underexposed value as gain * (well-exposed value)^exponent: sRGB values, or the light they stand for."""
+    """An underexposed value as gain * (well-exposed value)^exponent: sRGB values, or with `of_light` linear light."""
 
     exponent: float
     gain: float
@@ -50,20 +49,20 @@ def darkening(
     Args:
         dark_level: mean sRGB value of the dark frames, in (0, 1).
         lit_level: mean sRGB value that a well-lit image is expected to have.
-        tone: how it became dark: "linear-light", as a camera does; by a "gain" on sRGB values, as many programs do; or
+        tone: how it became dark: "linear-light", as in a camera; by a "gain" on sRGB values, as in many programs; or
             the exponent itself.
-        of_light: whether the law is to be one of light, where "linear-light" is a gain.
+        of_light: whether the law is to be one of linear light, where "linear-light" is a gain; `tone` is then ignored.
     """
     if of_light:
         dark, lit = srgb_to_linear(np.array([dark_level, lit_level]))
-        return Darkening(LEAST_EXPONENT, min(dark / lit**LEAST_EXPONENT, 1.0), of_light=True)
+        return Darkening(MIN_EXPONENT, min(dark / lit**MIN_EXPONENT, 1.0), of_light=True)
     if tone == "linear-light":
         dark, lit = srgb_to_linear(np.array([dark_level, lit_level]))
         well = np.linspace(0.1, 0.9, 81)
         low = linear_to_srgb(min(dark / lit, 1.0) * srgb_to_linear(well))
-        exponent = np.clip(np.polyfit(np.log(well), np.log(low), 1)[0], LEAST_EXPONENT, MOST_EXPONENT)
+        exponent = np.clip(np.polyfit(np.log(well), np.log(low), 1)[0], MIN_EXPONENT, MAX_EXPONENT)
         return Darkening(float(exponent), float(np.exp(np.mean(np.log(low) - exponent * np.log(well)))))
-    exponent = LEAST_EXPONENT if tone == "gain" else float(tone)
+    exponent = MIN_EXPONENT if tone == "gain" else float(tone)
     return Darkening(exponent, min(dark_level / lit_level**exponent, 1.0))
 
 
@@ -76,44 +75,45 @@ def lit_level(
         images: sRGB values in [0, 1].
         valid: which pixels count; None for all.
         dark_level: mean of `images`, in (0, 1).
-        of_light: whether a factor on light is looked for, or one on sRGB values.
+        of_light: whether frames are brightened by a factor on linear light, or by one on sRGB values.
     """
-    brightest = np.concatenate([image.max(-1)[counted] for image, counted in _looked_at(images, valid)])
-    known = np.array([dark_level, MID_GREY, np.quantile(brightest, HIGHLIGHTS), BRIGHTEST])
-    dark, grey, highlights, most = srgb_to_linear(known) if of_light else known
-    level = np.asarray(grey * np.clip(most / (highlights * grey / dark), MOST_GIVEN_WAY, 1.0))
+    brightest = np.concatenate([image.max(-1)[counted] for image, counted in _sampled_frames(images, valid)])
+    known = np.array([dark_level, MID_GREY, np.quantile(brightest, HIGHLIGHT_QUANTILE), MAX_HIGHLIGHTS])
+    dark, grey, highlights, limit = srgb_to_linear(known) if of_light else known
+    level = np.asarray(grey * np.clip(limit / (highlights * grey / dark), MIN_LEVEL_FACTOR, 1.0))
     return float(linear_to_srgb(level) if of_light else level)
 
 
 def recognise(images: Float[np.ndarray, "F H W 3"], valid: Bool[np.ndarray, "F H W"] | None = None) -> Tone:
-    """How dark frames became dark, as far as they tell.
+    """How dark frames became dark, as far as they show it.
 
-    A sensor that sees little light is noisy, and what its scaled light loses in level the sRGB curve returns as
-    contrast. Frames that are both clean and flat were darkened by a gain. A camera's own noise reduction and a scene
-    of little contrast can look the same: only then is the answer wrong, and the user's to correct.
+    A sensor that sees little light is noisy, and the sRGB curve, which is steeper for dark values in log-log
+    coordinates, raises the contrast. So frames that are both clean and flat were darkened by a gain. A camera's noise
+    reduction together with a scene of little contrast can look the same: only then is the answer wrong, and the user
+    has to correct it.
 
     Args:
         images: sRGB values in [0, 1].
         valid: which pixels count; None for all.
     """
     noise, levels = [], []
-    for image, counted in _looked_at(images, valid):
-        noise.append(_roughness(image)[counted])
+    for image, counted in _sampled_frames(images, valid):
+        noise.append(_local_noise(image)[counted])
         levels.append(image.mean(-1)[counted])
-    clean = np.quantile(np.concatenate(noise), SMOOTHEST) < CLEAN
-    flat = np.log(np.maximum(np.concatenate(levels), 0.5 / 255)).std() < FLAT
+    clean = np.quantile(np.concatenate(noise), NOISE_QUANTILE) < MAX_CLEAN_NOISE
+    flat = np.log(np.maximum(np.concatenate(levels), 0.5 / 255)).std() < MAX_FLAT_CONTRAST
     return "gain" if clean and flat else "linear-light"
 
 
-def _looked_at(
+def _sampled_frames(
     images: Float[np.ndarray, "F H W 3"], valid: Bool[np.ndarray, "F H W"] | None
 ) -> Iterator[tuple[Float[np.ndarray, "H W 3"], Bool[np.ndarray, "H W"]]]:
-    for index in np.unique(np.linspace(0, len(images) - 1, LOOKED_AT).round().astype(int)):
+    for index in np.unique(np.linspace(0, len(images) - 1, SAMPLED_FRAMES).round().astype(int)):
         image = images[index].astype(np.float32)
         yield image, np.ones(image.shape[:2], bool) if valid is None else valid[index]
 
 
-def _roughness(image: Float[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H W"]:
-    """Deviation of what is left of the pixels around each one when planes are taken away (Immerkaer, 1996)."""
+def _local_noise(image: Float[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H W"]:
+    """Standard deviation, in a window around each pixel, of what is not locally a plane (Immerkaer, 1996)."""
     rest = cv2.filter2D(image, -1, np.outer([1, -2, 1], [1, -2, 1]).astype(np.float32)) / 6
-    return np.sqrt(cv2.blur(np.square(rest).mean(-1), (WINDOW, WINDOW)))
+    return np.sqrt(cv2.blur(np.square(rest).mean(-1), (NOISE_WINDOW, NOISE_WINDOW)))

@@ -1,1 +1,1 @@
-"""What is done with footage before training: poses, masks of what moves, low-light twins."""
+"""Preparing footage before training: poses, masks of what moves, low-light twins, brightening."""

@@ -1,4 +1,4 @@
-"""Zero-DCE (arXiv 2001.06826): curves that brighten every pixel of a picture, learned from dark pictures alone."""
+"""Zero-DCE (arXiv 2001.06826): per-pixel curves that brighten a picture, learned from dark pictures alone."""
 
 from collections.abc import Iterator
 
@@ -15,12 +15,12 @@ from l2dgs_jax.training.optimizer import Schedule
 from l2dgs_jax.types import Conv
 
 ITERATIONS, WIDTH = 8, 32  # of the curve; channels of every hidden layer
-LEVEL, WINDOW = 0.6, 16  # mean wanted of every block, and its side in pixels
+EXPOSURE_LEVEL, EXPOSURE_WINDOW = 0.6, 16  # target mean of every block, and its side in pixels
 SPATIAL_WEIGHT, EXPOSURE_WEIGHT, COLOR_WEIGHT, SMOOTHNESS_WEIGHT = 1.0, 10.0, 5.0, 200.0
-# A few frames of one scene are learned in fewer and larger steps than photographs of all kinds.
+# A few frames of one scene need fewer and larger steps than photographs of all kinds.
 STEPS, BATCH, CROP, RATES = 200, 4, 64, (1e-3, 1e-4)
 
-Net = tuple[Conv, ...]  # seven 3x3 convolutions; the last three also read earlier ones
+Net = tuple[Conv, ...]  # seven 3x3 convolutions; the last three also read outputs of earlier ones
 Scalar = Float[Array, ""]
 
 
@@ -31,7 +31,7 @@ def init(key: PRNGKeyArray) -> Net:
 
 
 def curves(net: Net, images: Float[Array, "B H W 3"]) -> Float[Array, "B H W 24"]:
-    """Parameters of every pixel's curves in [-1, 1], those of a channel side by side. Gradients flow to both."""
+    """Parameters of every pixel's curves, in [-1, 1]: `ITERATIONS` for each channel. Gradients flow to both."""
     x = [images]
     for layer in net[:4]:
         x.append(jax.nn.relu(apply_conv(layer, x[-1])))
@@ -41,7 +41,7 @@ def curves(net: Net, images: Float[Array, "B H W 3"]) -> Float[Array, "B H W 24"
 
 
 def brighten(net: Net, images: Float[Array, "B H W 3"]) -> Float[Array, "B H W 3"]:
-    """Pictures after their curves; sRGB values stay in [0, 1]. Gradients flow to both."""
+    """Pictures after applying their curves; sRGB values stay in [0, 1]. Gradients flow to both."""
     return _bend(images, curves(net, images))
 
 
@@ -50,21 +50,21 @@ def _bend(images: Float[Array, "B H W 3"], curves: Float[Array, "B H W 24"]) -> 
 
 
 def loss(net: Net, images: Float[Array, "B H W 3"]) -> Scalar:
-    """Its objective: steps between blocks stay, blocks are well exposed, the mean is grey, and curves are smooth."""
+    """Zero-DCE's objective: keep differences between blocks, expose blocks well, grey mean, smooth curves."""
     parameters = curves(net, images)
     bright = _bend(images, parameters)
     means = bright.mean((1, 2))
     tints = means - jnp.roll(means, 1, axis=-1)
     return (
         SPATIAL_WEIGHT * squared_steps(block_means((bright - images).mean(-1))[..., None])
-        + EXPOSURE_WEIGHT * exposure(bright, LEVEL, WINDOW, "squared")
+        + EXPOSURE_WEIGHT * exposure(bright, EXPOSURE_LEVEL, EXPOSURE_WINDOW, "squared")
         + COLOR_WEIGHT * jnp.square(tints).sum(-1).mean()
         + SMOOTHNESS_WEIGHT * smoothness_loss(parameters)
     )
 
 
 def learn(images: Float[np.ndarray, "F H W 3"], seed: int) -> Net:
-    """A network for the pictures of one scene, sRGB values in [0, 1]."""
+    """Train a network on the pictures of one scene, sRGB values in [0, 1]."""
     net = init(jax.random.key(seed))
     rate = Schedule(*(jnp.asarray(value, float) for value in (*RATES, STEPS)))
     bar = tqdm(_crops(images, seed), total=STEPS, desc="brighten", unit="step", dynamic_ncols=True, disable=None)
@@ -74,7 +74,7 @@ def learn(images: Float[np.ndarray, "F H W 3"], seed: int) -> Net:
 
 
 def _crops(images: Float[np.ndarray, "F H W 3"], seed: int) -> Iterator[tuple[Float[Array, "B h w 3"]]]:
-    """Random parts of random pictures, half of them mirrored."""
+    """Batches of random crops of random pictures, half of them mirrored."""
     rng = np.random.default_rng(seed)
     _, height, width, _ = images.shape
     rows, columns = min(CROP, height), min(CROP, width)

@@ -1,4 +1,4 @@
-"""Gaussians -> images: projection, lists of Gaussians for every tile, blending."""
+"""Rasterization of Gaussians: projection, lists of Gaussians for every tile, blending."""
 
 from l2dgs_jax.rasterizer.rasterization import count_pairs, rasterize
 

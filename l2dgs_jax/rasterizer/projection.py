@@ -11,7 +11,7 @@ from l2dgs_jax.kernels.fusion import fusion_boundary
 
 NEAR_PLANE = 0.01  # world units
 EPS_2D = 0.3  # pixels^2
-FIELD_MARGIN = 0.3  # of half the field of view: how far outside the image the Jacobian still follows the centre
+FIELD_MARGIN = 0.3  # of half the field of view: the Jacobian follows centres up to that far outside the image
 
 
 Column = Float[Array, " N"]
@@ -23,10 +23,10 @@ class Projected(NamedTuple):
 
     Attributes:
         means2d: centres in pixels.
-        covariances2d: (xx, xy, yy) in pixels^2, blur included.
+        covariances2d: (xx, xy, yy) in pixels^2, including the blur `eps2d`.
         conics: (xx, xy, yy) of the inverse of the covariance, pixels^-2.
         depths: distance along the camera's z axis, world units.
-        visible: whether the centre lies beyond the near plane; values of other rows are finite and meaningless.
+        visible: whether the centre lies beyond the near plane; otherwise the other values are finite but meaningless.
     """
 
     means2d: Float[Array, "*B N 2"]
@@ -52,7 +52,7 @@ def project(
     near_plane: Float[Array, ""] | float = NEAR_PLANE,
     eps2d: float = EPS_2D,
 ) -> Projected:
-    """Project Gaussians by a pinhole camera, to first order around their centres (EWA; 3DGS, arXiv 2308.04079).
+    """Project Gaussians with a pinhole camera, to first order around their centres (EWA; 3DGS, arXiv 2308.04079).
 
     Gradients flow to means, quats, scales, viewmat and K, in reverse mode only, and are zero for Gaussians nearer than
     the near plane.
@@ -77,11 +77,11 @@ def project(
     return Projected(jnp.stack(centre).T, jnp.stack(covariance).T, jnp.stack(conic).T, depth, visible)
 
 
-# Every entry of a point or a matrix is a column, one vector over all Gaussians: arithmetic with whole columns is what
-# CPUs are fast at. Columns are kept between the functions; within one they are computed again for each that needs them.
+# Every entry of a point or a matrix is a column, one vector over all Gaussians, because CPUs are fast at arithmetic
+# with whole columns. Columns are stored only between the functions below; within one, XLA recomputes them where needed.
 
 
-@cache  # one function for each number: what was compiled is found again
+@cache  # always the same function object for the same numbers, so that jax finds what it has compiled
 def _bounded(function: Callable[..., Any], **numbers: float) -> Callable[..., Any]:
     return fusion_boundary(partial(function, **numbers))
 
@@ -145,7 +145,7 @@ def _covariance(u: Columns, v: Columns, *, eps2d: float) -> Columns:
 
 
 def _conic(xx: Column, xy: Column, yy: Column, *, eps2d: float) -> Columns:
-    # Cauchy-Schwarz bounds the unblurred determinant by zero; the blur keeps this sum positive after rounding too.
+    # The determinant without blur is at least 0 (Cauchy-Schwarz); the blur keeps the sum positive despite rounding.
     determinant = (xx - eps2d) * (yy - eps2d) - xy * xy
     determinant = jnp.maximum(determinant, 0) + eps2d * (xx + yy - eps2d)
     return yy / determinant, -xy / determinant, xx / determinant

@@ -9,12 +9,12 @@ from jaxtyping import Array, Float, Int
 
 from l2dgs_jax.kernels.blend import blend
 from l2dgs_jax.kernels.fusion import fusion_boundary
-from l2dgs_jax.kernels.tiles import TILE, grid
+from l2dgs_jax.kernels.tiles import TILE_SIZE, grid
 from l2dgs_jax.rasterizer.projection import EPS_2D, NEAR_PLANE, Projected, project
 from l2dgs_jax.rasterizer.tile_lists import Footprints, footprints, intersect, pairs_needed
 from l2dgs_jax.types import RasterOutput
 
-LEAST_ALPHA = 1e-10  # that an expected depth is divided by: nothing drawn is as faint
+LEAST_ALPHA = 1e-10  # least divisor of an expected depth; any pixel with a Gaussian has a larger alpha
 
 
 def rasterize(
@@ -36,10 +36,10 @@ def rasterize(
 ) -> RasterOutput:
     """Draw Gaussians: all feature channels, alpha and depth in one pass (Eqs. 5, 6 and 8).
 
-    Cameras have no leading axis or one, of views, whose tiles go through one sort and one blend. Gaussians have none,
-    and are then shared by all views, or the same one, and every view has its own. A contribution has
-    alpha = min(0.999, o exp(-q/2)) and is skipped below 1/255; the Gaussian that would bring the transmittance to 1e-4
-    or less ends its pixel and is left out. No background.
+    Cameras have no leading axis, or an axis of views, which are sorted and blended together. Gaussians without a
+    leading axis are shared by all views; with the axis of views, every view has its own. A contribution has
+    alpha = min(0.999, o exp(-q/2)), with opacity o and Mahalanobis distance sqrt(q), and is skipped below 1/255. The
+    Gaussian that would bring the transmittance to 1e-4 or less ends its pixel and is itself left out. No background.
 
     Gradients flow to every array. alpha has none where it is clipped at 0.999.
 
@@ -53,18 +53,18 @@ def rasterize(
         K: intrinsics, pixels.
         width: pixels.
         height: pixels.
-        near_plane: world units, more than 0; Gaussians whose centre is nearer to the camera's plane are not drawn.
-        eps2d: pixels^2, more than 0, added to the projected covariance: no Gaussian falls between pixels. Every value
-            is a compilation.
-        depth_mode: depth along the camera's z axis, world units, as "accumulated", the sum of w z over the Gaussians of
-            a pixel, or "expected", that sum over their accumulated opacity.
-        means2d_probe: added to the projected centres, pixels; zeros, whose gradient is dL/d(mean2d).
-        pair_capacity: room for (Gaussian, tile) pairs of all views. None counts them first, which needs concrete
-            arrays: outside jit and vmap only.
+        near_plane: world units, more than 0; Gaussians whose centre has a smaller depth are not drawn.
+        eps2d: pixels^2, more than 0, added to the projected covariance so that no Gaussian falls between pixels. Every
+            new value compiles the function again.
+        depth_mode: kind of depth along the camera's z axis, world units: "accumulated", the sum of weight times z over
+            the Gaussians of a pixel, or "expected", that sum divided by their accumulated opacity.
+        means2d_probe: added to the projected centres, pixels: zeros whose gradient is dL/d(mean2d).
+        pair_capacity: size of the buffer for (Gaussian, tile) pairs of all views. None counts the pairs first, which
+            needs concrete arrays, so it works only outside jit and vmap.
 
     Raises:
-        ValueError: `pair_capacity` is None under a transformation that hides the arrays' values; there are Gaussians
-            for other views than there are cameras; or there is no such `depth_mode`.
+        ValueError: `pair_capacity` is None under jit or vmap; Gaussians and cameras have different numbers of views; or
+            there is no such `depth_mode`.
     """
     if depth_mode not in ("accumulated", "expected"):
         raise ValueError(f"depth_mode is {depth_mode!r}; expected 'accumulated' or 'expected'")
@@ -84,7 +84,7 @@ def rasterize(
             needed = int(count_pairs(*geometry, means2d_probe=probe, **static))
         except jax.errors.ConcretizationTypeError:
             raise ValueError("rasterize needs a static pair_capacity under jit or vmap") from None
-        # Three significant bits: at most a quarter of the room is wasted, and few sizes are ever compiled.
+        # Rounded up to three significant bits: wastes at most a quarter of the buffer, and few sizes are compiled.
         step = 1 << max(needed.bit_length() - 3, 8)
         pair_capacity = max(-(-needed // step), 1) * step
     output = _rasterize(*arrays, **static, capacity=pair_capacity)
@@ -172,7 +172,7 @@ def _rasterize(
 
 
 def _untiled(tiles: Float[Array, "T C P"], width: int, height: int) -> Float[Array, "V H W C"]:
-    """The images that tiles belong to."""
+    """The images that consist of these tiles."""
     columns, rows = grid(width, height)
-    image = tiles.reshape(-1, rows, columns, tiles.shape[1], TILE, TILE).transpose(0, 1, 4, 2, 5, 3)
-    return image.reshape(-1, rows * TILE, columns * TILE, tiles.shape[1])[:, :height, :width]
+    image = tiles.reshape(-1, rows, columns, tiles.shape[1], TILE_SIZE, TILE_SIZE).transpose(0, 1, 4, 2, 5, 3)
+    return image.reshape(-1, rows * TILE_SIZE, columns * TILE_SIZE, tiles.shape[1])[:, :height, :width]

@@ -1,4 +1,4 @@
-"""A dense rasterizer to test the fast one against: every Gaussian over every pixel, differentiated by JAX."""
+"""A dense rasterizer to test the fast one against: every Gaussian at every pixel, differentiated by JAX."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float

@@ -8,18 +8,18 @@ from jaxtyping import Array, Float, Int
 
 from l2dgs_jax.kernels.sort import argsort, sort_pairs
 from l2dgs_jax.kernels.tile_lists import list_pairs
-from l2dgs_jax.kernels.tiles import MIN_ALPHA, TILE, TileLists, Tiling, grid
+from l2dgs_jax.kernels.tiles import MIN_ALPHA, TILE_SIZE, TileLists, Tiling, grid
 from l2dgs_jax.rasterizer.projection import Projected
 
 
 class Footprints(NamedTuple):
-    """Where Gaussians can be seen.
+    """Where in the images Gaussians are visible.
 
     Attributes:
-        reach: largest d^T conic d at which alpha reaches 1/255; negative where it never does.
-        radii: half-widths of the box around that ellipse, pixels; zero where nothing is drawn.
+        reach: largest d^T conic d at which alpha is at least 1/255; negative if it never is.
+        radii: half-widths in x and y of the box around that ellipse, pixels; zero for Gaussians that are not drawn.
         first: first column and row of tiles that the box touches.
-        counts: number of columns and rows; both zero where nothing is drawn.
+        counts: number of columns and rows of tiles; both zero for Gaussians that are not drawn.
     """
 
     reach: Float[Array, "V N"]
@@ -30,13 +30,13 @@ class Footprints(NamedTuple):
 
 def footprints(projected: Projected, opacities: Float[Array, "V N"], width: int, height: int) -> Footprints:
     """The opacity-aware box of tiles around each Gaussian; carries no gradients."""
-    # The slack keeps a rounding error from dropping a contribution of exactly 1/255.
+    # The slack of 1e-3 keeps rounding errors from dropping a contribution of exactly 1/255.
     reach = 2 * jnp.log(jnp.maximum(opacities, 1e-30) / MIN_ALPHA) + 1e-3
     radii = jnp.sqrt(jnp.maximum(reach, 0)[..., None] * projected.covariances2d[..., ::2])
     shape = jnp.array(grid(width, height), radii.dtype)[None, None]
     # Measured between pixel centres, which lie 0.5 inside a tile's border.
-    first = jnp.clip(jnp.ceil((projected.means2d - radii + 0.5) / TILE) - 1, 0, shape)
-    last = jnp.clip(jnp.floor((projected.means2d + radii - 0.5) / TILE) + 1, 0, shape)
+    first = jnp.clip(jnp.ceil((projected.means2d - radii + 0.5) / TILE_SIZE) - 1, 0, shape)
+    last = jnp.clip(jnp.floor((projected.means2d + radii - 0.5) / TILE_SIZE) + 1, 0, shape)
     broken = ~jnp.isfinite(projected.means2d + radii)
     first, last = jnp.where(broken, 0, first), jnp.where(broken, shape, last)
     counts = jnp.maximum(last - first, 0).astype(jnp.int32)
@@ -63,7 +63,7 @@ def intersect(projected: Projected, boxes: Footprints, width: int, height: int, 
         boxes: their footprints.
         width: pixels.
         height: pixels.
-        capacity: size of the list; pairs beyond it are dropped (see `pairs_needed`).
+        capacity: size of the list; pairs that do not fit are dropped (see `pairs_needed`).
     """
     views, count = boxes.reach.shape
     columns, rows = grid(width, height)

@@ -1,4 +1,4 @@
-"""Runs: trained scenes in memory, and the folders that they lie in."""
+"""Runs: trained scenes in memory, and their folders on disk."""
 
 from l2dgs_jax.runs.checkpoints import Checkpoint
 from l2dgs_jax.runs.fitting import fit

@@ -1,4 +1,4 @@
-"""What a user should know before a long training."""
+"""Warnings that a user should get before a long training."""
 
 import math
 
@@ -12,7 +12,7 @@ FEW_FRAMES = 8
 
 
 def misfit(dataset: Dataset, config: Config) -> str | None:
-    """One sentence on what in a scene does not suit the settings, the costliest first; None if all does."""
+    """One sentence on the costliest mismatch between scene and settings; None if there is none."""
     pixels = dataset.width * dataset.height
     if pixels > MANY_PIXELS:
         factor = math.ceil(math.sqrt(pixels / MANY_PIXELS))

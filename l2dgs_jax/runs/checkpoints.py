@@ -1,4 +1,4 @@
-"""Training states on disk: one .npz a state, written whole or not at all, and the last few of them kept."""
+"""Checkpoints on disk: one .npz file per training state, written whole or not at all; the last few are kept."""
 
 import contextlib
 import itertools
@@ -22,11 +22,11 @@ from l2dgs_jax.runtime.files import flush, replacing
 from l2dgs_jax.training.initial_state import state_shapes
 from l2dgs_jax.training.state import TrainState
 
-_STEP = ".step"  # of the arrays in a file, that of `TrainState.step`
-VERSION = 2  # of the files; those of version 1 have no version and no halvings
+_STEP = ".step"  # name of the array in a file that holds `TrainState.step`
+VERSION = 2  # of the file format; files of version 1 have no version and no halvings
 
-# What a reader of zip, npy and JSON stumbles over in a file that is not what it should be.
-DAMAGE = (
+# Exceptions that reading zip, npy and JSON raises for damaged files.
+DAMAGE_ERRORS = (
     OSError,
     ValueError,
     KeyError,
@@ -41,16 +41,16 @@ DAMAGE = (
 
 
 class DamagedError(UserError):
-    """A file is no whole checkpoint."""
+    """A file is damaged or is not a checkpoint."""
 
 
 class Checkpoint(NamedTuple):
-    """Where a training stands.
+    """The state of a training, and what else it takes to resume it.
 
     Attributes:
-        state: its state.
-        pair_capacity: size of the pair buffer that it ran with, if it has run.
-        halvings: how often its learning rates were halved, because it diverged.
+        state: the training state.
+        pair_capacity: size of the rasterizer's pair buffer in the last step; None before the first.
+        halvings: how often the learning rates were halved because the training diverged.
     """
 
     state: TrainState
@@ -59,13 +59,13 @@ class Checkpoint(NamedTuple):
 
 
 def save(path: Path, checkpoint: Checkpoint, config: Config, keep: int = 1) -> None:
-    """Write a state, one array after the other; it is on the disk before it takes the place of the one before it.
+    """Write a checkpoint array by array; it is flushed to the disk before it replaces the previous one.
 
     Args:
         path: the file.
         checkpoint: what to write.
-        config: the settings that it was trained with.
-        keep: how many files to keep, this one included; see `kept`.
+        config: the settings of the training.
+        keep: how many checkpoints to keep, this one included; see `kept`.
 
     Raises:
         UserError: the file cannot be written.
@@ -80,45 +80,45 @@ def save(path: Path, checkpoint: Checkpoint, config: Config, keep: int = 1) -> N
                 _write(archive, jax.tree_util.keystr(key), np.asarray(leaf))
         flush(temporary)
         _make_way(path, keep)
-    with contextlib.suppress(OSError):  # where folders cannot be flushed
+    with contextlib.suppress(OSError):  # some systems cannot flush folders
         flush(path.parent)
 
 
 def kept(path: Path) -> list[Path]:
-    """The checkpoints that are there, the last one first: checkpoint.npz, checkpoint-1.npz, checkpoint-2.npz ..."""
+    """The existing checkpoints, newest first: checkpoint.npz, checkpoint-1.npz, checkpoint-2.npz ..."""
     name = re.compile(rf"{re.escape(path.stem)}-(\d+){re.escape(path.suffix)}")
     earlier = {int(found[1]): file for file in path.parent.glob("*") if (found := name.fullmatch(file.name))}
     return [*([path] if path.exists() else []), *(file for _, file in sorted(earlier.items()))]
 
 
 def drop_after(path: Path, step: int) -> None:
-    """Remove the checkpoints of later steps; files that are damaged stay.
+    """Remove the checkpoints of later steps than `step`; damaged files stay.
 
     Args:
-        path: where the last one should be.
+        path: file of the last checkpoint.
         step: number of finished steps.
     """
     for file in kept(path):
         try:
             with zipfile.ZipFile(file) as archive:
                 later = _read(archive, _STEP) > step
-        except DAMAGE:
+        except DAMAGE_ERRORS:
             continue
         if later:
             file.unlink()
 
 
 def load_last(path: Path, config: Config, num_frames: int, skip: int = 0) -> Checkpoint:
-    """Read the last checkpoint that is whole, with a warning of those after it.
+    """Read the last undamaged checkpoint; warns about each damaged one after it.
 
     Args:
-        path: where the last one should be.
+        path: file of the last checkpoint.
         config: see `load`.
         num_frames: see `load`.
-        skip: go further back by so many, but not beyond the first that was kept.
+        skip: number of the latest checkpoints to skip; the oldest one is never skipped.
 
     Raises:
-        UserError: none is whole, or as `load`.
+        UserError: all are damaged, or as `load`.
     """
     files, damaged = kept(path) or [path], []
     for file in files[min(skip, len(files) - 1) :]:
@@ -134,16 +134,16 @@ def load_last(path: Path, config: Config, num_frames: int, skip: int = 0) -> Che
 
 
 def load(path: Path, config: Config, num_frames: int) -> Checkpoint:
-    """Read what `save` wrote, one array after the other, and none before all are known to fit.
+    """Read what `save` wrote, array by array, after the headers of all arrays have been checked.
 
     Args:
         path: the file.
-        config: the settings that the checkpoint must have been written with, but for those in `EXECUTION`.
-        num_frames: training frames of the scene.
+        config: the settings that the checkpoint must have been written with, except those in `EXECUTION`.
+        num_frames: number of training frames of the scene.
 
     Raises:
-        UserError: the file is missing, of other settings, or of a later version.
-        DamagedError: it is incomplete.
+        UserError: the file is missing, was written with other settings, or has a later version.
+        DamagedError: the file is damaged or is not a checkpoint.
     """
     leaves, treedef = jax.tree_util.tree_flatten_with_path(state_shapes(config, num_frames))
     expected = {jax.tree_util.keystr(key): leaf for key, leaf in leaves}
@@ -153,9 +153,9 @@ def load(path: Path, config: Config, num_frames: int) -> Checkpoint:
             version = header.get("version", 1)
             if version > VERSION:
                 raise UserError(
-                    f"{path}: of version {version}; expected at most {VERSION}: a later l2dgs_jax has written it"
+                    f"{path}: of version {version}; expected at most {VERSION}: a newer l2dgs_jax has written it"
                 )
-            written = to_dict(from_dict(header["config"]))  # with the defaults of settings that were added since
+            written = to_dict(from_dict(header["config"]))  # completed by the defaults of settings added since
             difference = _first_difference(written, to_dict(config))
             if difference:
                 raise UserError(f"{path}: written with other settings ({difference}); expected those of this run")
@@ -171,15 +171,15 @@ def load(path: Path, config: Config, num_frames: int) -> Checkpoint:
         raise UserError(f"{path}: no such checkpoint; expected one that train wrote") from None
     except jax.errors.JaxRuntimeError:  # out of memory
         raise
-    except DAMAGE:
+    except DAMAGE_ERRORS:
         raise DamagedError(f"{path}: truncated or not a checkpoint; expected a whole file that train wrote") from None
 
 
 def _make_way(path: Path, keep: int) -> None:
-    """Move what is to be kept one place back, and remove the rest."""
+    """Rename the checkpoints that are kept, each one place back, and remove the others."""
     places = [path, *(path.with_name(f"{path.stem}-{index}{path.suffix}") for index in range(1, keep))]
     for later, earlier in reversed(list(itertools.pairwise(places))):
-        if zipfile.is_zipfile(later):  # a truncated file should not push out a whole one
+        if zipfile.is_zipfile(later):  # a truncated file should not replace an intact one
             os.replace(later, earlier)
     for file in kept(path):
         if file not in places:
@@ -187,7 +187,7 @@ def _make_way(path: Path, keep: int) -> None:
 
 
 def _write(archive: zipfile.ZipFile, name: str, array: np.ndarray) -> None:
-    """Add an array as `np.savez` does, which would want all of them at once."""
+    """Add an array in the format of `np.savez`, which would need all of them in memory at once."""
     with archive.open(f"{name}.npy", "w", force_zip64=True) as file:
         npy.write_array(file, array, allow_pickle=False)
 
@@ -198,7 +198,7 @@ def _read(archive: zipfile.ZipFile, name: str) -> np.ndarray:
 
 
 def _fits(archive: zipfile.ZipFile, name: str, leaf: jax.ShapeDtypeStruct) -> bool:
-    """Whether an array is there and, as its header says, like `leaf` but for its number of rows and its precision."""
+    """Whether an array exists and, by its header, is like `leaf` except for the number of rows and the precision."""
     if f"{name}.npy" not in archive.namelist():
         return False
     with archive.open(f"{name}.npy") as file:

@@ -1,13 +1,13 @@
-"""How a training shows itself: by a bar on a terminal, lines in a log, JSON for programs, or not at all.
+"""How the progress of a training is shown: as a bar on a terminal, lines in a log, JSON for programs, or not at all.
 
-A display is told of events, `display(event, **facts)`:
+A display is called for every event, `display(event, **facts)`:
 
-* begin: it goes on after `step` of `steps`, at first and when it was put back;
-* compiling: the program of a `stage`, before the first step that needs it;
-* step: that of number `step`, of a `stage`, is done, and `left` seconds are if that is known yet;
+* begin: the training starts, resumes, or goes back, after `step` of `steps`;
+* compiling: the program of a `stage` is compiled, before the first step that needs it;
+* step: step number `step`, of a `stage`, is done; `left` seconds remain, or None if that is not known yet;
 * metrics: the facts are a line of metrics;
-* previews: the pictures after a `step` have been drawn, to `files` in the run folder;
-* any other: something has happened, and `message` says what.
+* previews: pictures after a `step` have been written to `files` in the run folder;
+* any other event: `message` says what has happened.
 """
 
 import contextlib
@@ -22,14 +22,14 @@ from tqdm import tqdm
 
 Display = Callable[..., None]
 
-INTERVAL = 30  # seconds between lines in a log
+LOG_INTERVAL = 30  # seconds between lines in a log
 
 
 @contextlib.contextmanager
 def choose(quiet: bool = False, as_json: bool = False) -> Iterator[Display]:
     """The display that is asked for, or else the one that suits standard error.
 
-    Within the block standard output is for JSON alone where that is asked for, and leads nowhere where all is quiet.
+    Within the block, other standard output goes to standard error if JSON is asked for, and is discarded if `quiet`.
     """
     if as_json:
         output = sys.stdout
@@ -46,7 +46,7 @@ def choose(quiet: bool = False, as_json: bool = False) -> Iterator[Display]:
 
 
 def together(displays: Sequence[Display]) -> Display:
-    """A display that tells all of these."""
+    """A display that passes every event to all of these."""
 
     def tell(event: str, **facts: Any) -> None:
         for display in displays:
@@ -56,14 +56,14 @@ def together(displays: Sequence[Display]) -> Display:
 
 
 def _as_json(event: str, facts: dict[str, Any]) -> str:
-    """An object and its newline, to be printed in one piece: threads tell things too."""
+    """A JSON object and its newline, to be printed in one piece because several threads report events."""
     if event == "step":
         return ""
     return json.dumps(facts if event == "metrics" else {"event": event} | facts) + "\n"
 
 
 class _Steps(tqdm):
-    """tqdm's own time left takes all steps for alike."""
+    """A bar that shows `left`: tqdm's own estimate of the time left assumes that all steps take equally long."""
 
     left: float | None = None
 
@@ -73,7 +73,7 @@ class _Steps(tqdm):
 
 
 class _Bar:
-    """A bar with the time left."""
+    """A progress bar on a terminal."""
 
     def __init__(self) -> None:
         self.bar: _Steps | None = None
@@ -107,7 +107,7 @@ class _Bar:
 
 
 class _Log:
-    """A line now and then."""
+    """A line in a log now and then."""
 
     def __init__(self) -> None:
         self.steps, self.due = 0, 0.0
@@ -122,7 +122,7 @@ class _Log:
         elif event == "step":
             self.left = facts["left"]
         elif event == "metrics" and (now >= self.due or facts["step"] == self.steps):
-            self.due = now + INTERVAL
+            self.due = now + LOG_INTERVAL
             left = f", {tqdm.format_interval(self.left)} left" if self.left else ""
             _write(f"{facts['stage']} {facts['step']}/{self.steps}: {_summary(facts)}{left}")
         elif "message" in facts:

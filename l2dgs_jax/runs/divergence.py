@@ -1,4 +1,4 @@
-"""What is done about a training that diverges: it goes on from a checkpoint, with lower learning rates."""
+"""Handling of trainings that diverge: they continue from a checkpoint with lower learning rates."""
 
 import dataclasses
 import json
@@ -14,60 +14,61 @@ from l2dgs_jax.runs.checkpoints import Checkpoint
 from l2dgs_jax.runs.folder import last_checkpoint
 from l2dgs_jax.runtime.files import write_json
 
-HALVINGS = 3  # of the learning rates, after which a training is given up
-RATES = "rates.json"  # how often those of a run folder were halved, if they were
+MAX_HALVINGS = 3  # of the learning rates; then a training is given up
+RATES_FILE = "rates.json"  # in the run folder: how often the learning rates were halved, if ever
 
-# A loss has exploded if SUSTAINED lines of metrics in a row are EXPLOSION times the lowest median of STEADY in a row
-# before them. In 79 trainings that went well, births and starts of stages included, the most was 1.7 times.
-EXPLOSION, SUSTAINED, STEADY = 4.0, 3, 5
+# A loss has exploded if it exceeds EXPLOSION_FACTOR times its usual value in EXPLODED_LINES lines of metrics in a row.
+# The usual value is the lowest median of USUAL_LINES lines in a row before them. In 79 trainings that went well, the
+# largest factor was 1.7, including steps after new Gaussians were added and starts of stages.
+EXPLOSION_FACTOR, EXPLODED_LINES, USUAL_LINES = 4.0, 3, 5
 
 _RATES = [f"optim.{field.name}" for field in dataclasses.fields(OptimConfig) if "_lr" in field.name]
 
 
 def rate_factor(halvings: int) -> float:
-    """What the learning rates of the settings are multiplied by."""
+    """The factor on all learning rates after so many halvings."""
     return 0.5**halvings
 
 
 def with_lower_rates(config: Config, halvings: int) -> Config:
-    """The settings with all learning rates halved so often."""
+    """The settings with all learning rates halved `halvings` times."""
     rates = {name: overrides.read(config, name) * rate_factor(halvings) for name in _RATES}
     return overrides.replace(config, rates)
 
 
 def explosion(losses: Sequence[float]) -> float | None:
-    """What multiple of its usual value the loss has come to, if it has exploded.
+    """The loss as a multiple of its usual value, if it has exploded; otherwise None.
 
     Args:
         losses: of the lines of metrics so far.
     """
-    before, last = losses[:-SUSTAINED], losses[-SUSTAINED:]
-    if len(before) < STEADY:
+    before, last = losses[:-EXPLODED_LINES], losses[-EXPLODED_LINES:]
+    if len(before) < USUAL_LINES:
         return None
-    usual = np.median(np.lib.stride_tricks.sliding_window_view(before, STEADY), axis=1).min()
-    usual = max(usual, 1e-6)  # the last digit of a line
-    return float(min(last) / usual) if min(last) > EXPLOSION * usual else None
+    usual = np.median(np.lib.stride_tricks.sliding_window_view(before, USUAL_LINES), axis=1).min()
+    usual = max(usual, 1e-6)  # metrics are rounded to this
+    return float(min(last) / usual) if min(last) > EXPLOSION_FACTOR * usual else None
 
 
 def standing(folder: Path, dataset: Dataset, config: Config) -> Checkpoint:
-    """Where the training of a run folder goes on, also if it has diverged since its last checkpoint.
+    """Where the training of a run folder continues, also if it has diverged since its last checkpoint.
 
-    It then goes on from that checkpoint with its rates halved. If it diverges once more before it has written another,
-    the harm may have been done before: it goes back to the checkpoint before that one, and so on.
+    If it has, it continues from that checkpoint with halved learning rates. If it diverges again before it writes
+    another checkpoint, that one may have been harmed already: the training goes back to the one before, and so on.
 
     Args:
         folder: of the run.
         dataset: its scene.
-        config: its settings, what they left to the data filled in.
+        config: its settings, resolved by `training.resolve`.
 
     Raises:
-        UserError: no checkpoint is whole, or a file is of other settings or unreadable.
+        UserError: all checkpoints are damaged, or a file has other settings or is unreadable.
     """
     halvings, last = _halvings(folder), last_checkpoint(folder, dataset, config)
-    in_vain = halvings - last.halvings
-    if in_vain <= 0:
+    since_last = halvings - last.halvings
+    if since_last <= 0:
         return last
-    back = last_checkpoint(folder, dataset, config, skip=in_vain - 1)
+    back = last_checkpoint(folder, dataset, config, skip=since_last - 1)
     factor = rate_factor(halvings - back.halvings)
     schedules = {
         name: rate._replace(start=rate.start * factor, end=rate.end * factor)
@@ -78,16 +79,16 @@ def standing(folder: Path, dataset: Dataset, config: Config) -> Checkpoint:
 
 
 def halve_rates(folder: Path, halvings: int) -> None:
-    """Note in a run folder that its learning rates are to be halved so often.
+    """Record in a run folder that its learning rates are to be halved `halvings` times.
 
     Raises:
         UserError: it cannot be written.
     """
-    write_json(folder / RATES, {"halvings": halvings})
+    write_json(folder / RATES_FILE, {"halvings": halvings})
 
 
 def _halvings(folder: Path) -> int:
-    path = folder / RATES
+    path = folder / RATES_FILE
     if not path.exists():
         return 0
     try:

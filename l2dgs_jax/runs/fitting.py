@@ -1,4 +1,4 @@
-"""From a data set to a trained scene, in memory."""
+"""Training a scene from a data set, in memory."""
 
 import dataclasses
 from collections.abc import Callable
@@ -22,20 +22,21 @@ def fit(
 ) -> Run:
     """Train a scene, coarse stage then fine. Nothing is written to disk; `save_run` does that.
 
-    If jax has not started yet, every core of the processor becomes a device, as in the command lines.
+    If jax has not started yet, every CPU core becomes a device, as in the command lines.
 
     Args:
-        dataset: what was filmed, as `load_dataset` returns it. Settings of how a scene is read are taken from it.
+        dataset: frames and cameras, as `load_dataset` returns them. Its source overrides the settings of how a scene is
+            read (`Source.settings`).
         config: all other settings, such as one of `PRESETS`.
         on_step: called after every step; its argument is valid until it returns.
-        start: where to go on from; the beginning if not given.
-        device_count: how many devices the views of a step are spread over; as many as share them evenly if not given.
+        start: checkpoint to continue from; if not given, training starts from the beginning.
+        device_count: number of devices to spread the views of a step over; if not given, as many as get equal shares.
 
     Raises:
         DivergedError: the loss or a gradient is not finite.
-        UserError: the numbers of steps make no training.
-        ValueError: the views cannot be spread over so many devices, there are not that many, or one of several
-            processes would be left without.
+        UserError: a number of steps, views or checkpoints is invalid, or all training frames are black.
+        ValueError: the views cannot be shared evenly by so many devices, there are not that many, or a process would be
+            left without any.
     """
     config.check_counts()
     devices.one_per_core()

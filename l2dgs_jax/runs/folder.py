@@ -1,4 +1,4 @@
-"""The folder of a training run: what lies where, and how the other commands open it."""
+"""The folder of a training run: its files, and how the other commands open it."""
 
 import dataclasses
 import json
@@ -15,18 +15,18 @@ from l2dgs_jax.runtime.files import is_taken, make_folder, write_json
 from l2dgs_jax.training import initial_state
 
 SETTINGS = "config.json"
-CHECKPOINT = "checkpoint.npz"  # the last one; those before it are checkpoint-1.npz, checkpoint-2.npz ...
-COARSE = "coarse.npz"  # the state at the end of the coarse stage
+CHECKPOINT = "checkpoint.npz"  # the last one; earlier ones are checkpoint-1.npz, checkpoint-2.npz ...
+COARSE = "coarse.npz"  # the checkpoint at the end of the coarse stage
 METRICS = "metrics.jsonl"
 CONTACT_SHEET = "contact_sheet.png"
-VIDEO = "video"  # and the ending of its format
+VIDEO = "video"  # without its suffix, which depends on the format
 
 
 def write_settings(folder: Path, scene: str, config: Config) -> None:
     """Create the run folder and its `config.json`.
 
     Raises:
-        UserError: the folder cannot be made or written to.
+        UserError: the folder cannot be created or written to.
     """
     make_folder(folder)
     write_json(folder / SETTINGS, {"scene": scene, "settings": to_dict(config)})
@@ -36,7 +36,7 @@ def read_settings(folder: Path) -> tuple[str, Config]:
     """The scene and the settings of a run.
 
     Raises:
-        UserError: the folder is no run, or its settings cannot be read.
+        UserError: the folder is not that of a run, or its settings cannot be read.
     """
     path = folder / SETTINGS
     try:
@@ -49,18 +49,17 @@ def read_settings(folder: Path) -> tuple[str, Config]:
 
 
 def save_run(run: Run, folder: str | Path) -> Run:
-    """Write a run's settings and state to a new folder, which the commands and `open_run` take it from.
+    """Write a run's settings and state to a new folder, which the commands and `open_run` can open.
 
     Args:
         run: as `fit` returns it.
-        folder: to make.
+        folder: to create.
 
     Returns:
-        The run as it lies there.
+        The same run with its `folder` set.
 
     Raises:
-        UserError: the folder holds something already or cannot be written, or the run's data set was not read from a
-            scene.
+        UserError: the folder is not empty or cannot be written, or the run's data set was not read by `load_dataset`.
     """
     folder = Path(folder)
     if run.dataset.source is None:
@@ -76,11 +75,11 @@ def open_run(folder: str | Path, stage: Literal["final", "coarse"] = "final") ->
     """Open a run's folder.
 
     Args:
-        folder: that `train`, `sweep` or `save_run` wrote.
-        stage: "final" for the last whole checkpoint, "coarse" for the one at the end of the coarse stage.
+        folder: that `train`, `sweep` or `save_run` has written.
+        stage: "final" for the last undamaged checkpoint, "coarse" for the one at the end of the coarse stage.
 
     Raises:
-        UserError: settings, scene or checkpoint are missing or do not fit together.
+        UserError: settings, scene or checkpoint are missing or do not match.
     """
     folder = Path(folder)
     scene, config = read_settings(folder)
@@ -93,16 +92,16 @@ def open_run(folder: str | Path, stage: Literal["final", "coarse"] = "final") ->
 
 
 def last_checkpoint(folder: Path, dataset: Dataset, config: Config, skip: int = 0) -> Checkpoint:
-    """Where the training of a run folder stands: at its last whole checkpoint, or before the first step.
+    """The last undamaged checkpoint of a run folder, or the initial state if it has none.
 
     Args:
         folder: of the run.
         dataset: its scene.
-        config: its settings, what they left to the data filled in.
+        config: its settings, resolved by `training.resolve`.
         skip: see `checkpoints.load_last`.
 
     Raises:
-        UserError: no checkpoint is whole, or they are of other settings.
+        UserError: all checkpoints are damaged, or were written with other settings.
     """
     path = folder / CHECKPOINT
     if not checkpoints.kept(path):
@@ -111,7 +110,7 @@ def last_checkpoint(folder: Path, dataset: Dataset, config: Config, skip: int = 
 
 
 def read_metrics(folder: Path) -> list[dict[str, Any]]:
-    """The lines of a run's metrics, up to one that an interruption has torn."""
+    """The lines of a run's metrics; stops at a line that an interruption has left incomplete."""
     path = folder / METRICS
     lines = []
     for line in path.read_text(errors="replace").splitlines() if path.exists() else ():

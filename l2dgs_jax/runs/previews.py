@@ -1,4 +1,4 @@
-"""Two views of a scene while it trains, as small pictures in its run folder."""
+"""Previews: small pictures of two views of a scene while it trains, in its run folder."""
 
 import re
 from pathlib import Path
@@ -18,20 +18,20 @@ from l2dgs_jax.runtime.files import make_folder, replacing
 from l2dgs_jax.training.state import TrainState, with_capacity
 
 PREVIEWS = "previews"
-VIEWS = {"held-out": "test", "training": "train"}  # of which split
+VIEWS = {"held-out": "test", "training": "train"}  # names of the views, and the splits that they are from
 INPUT, LOWLIGHT, WELLLIT = "input", "lowlight", "welllit"
-MOST, APART = 8, 100  # moments of a run, and steps between them at least
-LONG = 1000  # steps of a coarse stage that are worth the compilation of a program of its own
-WIDTH, QUALITY = 320, 85  # pixels at most; of JPEG
+MAX_MOMENTS, MIN_STEPS_APART = 8, 100  # moments of a run at which previews are drawn, and steps between them
+LONG_COARSE_STAGE = 1000  # steps from which on a coarse stage has previews, for which a renderer must be compiled
+MAX_WIDTH, JPEG_QUALITY = 320, 85  # pixels
 
 
 class Preview(NamedTuple):
-    """A picture that lies in a run folder.
+    """A preview in a run folder.
 
     Attributes:
-        view: of `VIEWS`.
-        kind: what it shows.
-        step: after which; None for the frame itself.
+        view: key of `VIEWS`.
+        kind: what it shows: INPUT, LOWLIGHT or WELLLIT.
+        step: after which it was drawn; None for the input frame.
         path: of the file.
     """
 
@@ -42,25 +42,28 @@ class Preview(NamedTuple):
 
 
 def first(config: Config) -> int:
-    """The step after which views can be drawn by the program that draws those at the end."""
-    return 0 if config.coarse_steps >= LONG or not config.fine_steps else config.coarse_steps
+    """Number of steps before previews begin: the coarse stage, unless it is long or the only stage."""
+    return 0 if config.coarse_steps >= LONG_COARSE_STAGE or not config.fine_steps else config.coarse_steps
 
 
 def moments(config: Config) -> frozenset[int]:
-    """The steps after which views are drawn: by the program that draws the pictures at the end, compiled for both."""
-    count = min(MOST, max(config.steps // APART, 1))
+    """The steps after which previews are drawn, evenly spaced and beginning after `first`.
+
+    Those of the fine stage use the program that is compiled anyway for the pictures at the end of the run.
+    """
+    count = min(MAX_MOMENTS, max(config.steps // MIN_STEPS_APART, 1))
     evenly = (round(config.steps * part / count) for part in range(1, count + 1))
     return frozenset(step for step in evenly if step > first(config))
 
 
 def draw(folder: Path, dataset: Dataset, config: Config, state: TrainState) -> list[Path]:
-    """Draw the views in the middle of the held-out and of the training ones.
+    """Draw the held-out view and the training view that are in the middle of the clip.
 
     Args:
         folder: of the run, which exists.
         dataset: its scene.
-        config: its settings, what they left to the data filled in.
-        state: where it stands.
+        config: its settings, resolved by `training.resolve`.
+        state: the present state.
 
     Returns:
         The new files.
@@ -85,7 +88,7 @@ def draw(folder: Path, dataset: Dataset, config: Config, state: TrainState) -> l
 
 
 def kept(folder: Path) -> list[Preview]:
-    """The pictures that lie in a run folder, in the order of their steps."""
+    """The previews in a run folder, ordered by view, kind and step."""
     found = []
     for view in VIEWS:
         for path in sorted((folder / PREVIEWS / view).glob("*.jpg")):
@@ -96,7 +99,7 @@ def kept(folder: Path) -> list[Preview]:
 
 
 def drop_after(folder: Path, step: int) -> None:
-    """Remove the pictures of later steps, from a run that goes on from its last checkpoint."""
+    """Remove the previews of later steps than `step`, for a run that resumes from its last checkpoint."""
     for preview in kept(folder):
         if preview.step is not None and preview.step > step:
             preview.path.unlink()
@@ -107,7 +110,7 @@ def _path(folder: Path, view: str, kind: str, step: int | None = None) -> Path:
 
 
 def with_last_capacity(state: TrainState, config: Config) -> TrainState:
-    """With as many rows as at the end of the run, as far as that is known: every number of rows is a compilation."""
+    """Pad a state to its number of rows at the end of the run, if known: every number of rows is a compilation."""
     cfg, rows = config.density, len(state.scene.alive)
     most = int(cfg.max_gaussians) if cfg.method == "mcmc" and cfg.start < cfg.stop else 0
     return with_capacity(state, next_capacity(most)) if most > rows else state
@@ -115,8 +118,8 @@ def with_last_capacity(state: TrainState, config: Config) -> TrainState:
 
 def _write(path: Path, picture: UInt8[np.ndarray, "H W 3"]) -> None:
     height, width = picture.shape[:2]
-    if width > WIDTH:
-        picture = cv2.resize(picture, (WIDTH, round(height * WIDTH / width)), interpolation=cv2.INTER_AREA)
+    if width > MAX_WIDTH:
+        picture = cv2.resize(picture, (MAX_WIDTH, round(height * MAX_WIDTH / width)), interpolation=cv2.INTER_AREA)
     make_folder(path.parent)
     with replacing(path) as temporary:
-        temporary.write_bytes(encode_jpeg(picture, QUALITY))
+        temporary.write_bytes(encode_jpeg(picture, JPEG_QUALITY))

@@ -1,4 +1,4 @@
-"""What a training leaves in its run folder while it runs: metrics and checkpoints."""
+"""Recording a training in its run folder: metrics and checkpoints."""
 
 import json
 import time
@@ -20,7 +20,7 @@ from l2dgs_jax.training.optimizer import learning_rates
 
 LOG_EVERY = 10  # steps between lines of the metrics file
 
-# Of a line, beside the terms of the loss.
+# Fields of a line of metrics; all others are terms of the loss.
 _FACTS = ("step", "stage", "gaussians", "pairs", "loss", "psnr", "rate_factor", "rates", "memory", "seconds")
 
 
@@ -33,15 +33,15 @@ class Recorder:
     """Records one member of a training in its run folder.
 
     Attributes:
-        step: the last step that it was told of.
+        step: the last step that it was called for.
     """
 
     def __init__(self, folder: Path, config: Config, done: int, halvings: int = 0):
-        """Drop metrics after the step `done`, from a run that was interrupted after its last checkpoint.
+        """Remove the metrics of steps after `done`, which a run that was interrupted after a checkpoint may have.
 
         Args:
             folder: of the run, which exists.
-            config: its settings, what they left to the data filled in.
+            config: its settings, resolved by `training.resolve`.
             done: number of steps already taken.
             halvings: see `Checkpoint`.
         """
@@ -52,11 +52,11 @@ class Recorder:
             temporary.write_text("".join(f"{line}\n" for line in kept))
 
     def __call__(self, progress: Progress, member: int = 0) -> dict | None:
-        """Write what is due after a step.
+        """Write metrics and checkpoints that are due after a step.
 
         Args:
             progress: as `engine.run` yields it.
-            member: which of its members.
+            member: index of the member.
 
         Returns:
             The line of metrics, if one was due.
@@ -66,7 +66,7 @@ class Recorder:
         """
         self.step, config = progress.step, self.config
         last = self.step == config.steps
-        # Metrics first: those that are ahead of the last checkpoint are dropped when the run goes on from there.
+        # Metrics first: those after the last checkpoint are removed when the run resumes from it.
         line = self._line(progress, member) if self.step % LOG_EVERY == 0 or last else None
         if line:
             append_line(self.folder / METRICS, json.dumps(line))
@@ -77,7 +77,7 @@ class Recorder:
         return line
 
     def checkpoint(self, progress: Progress, member: int = 0) -> None:
-        """Write a checkpoint, unless that of this step was written already."""
+        """Write a checkpoint, unless this step's was already written."""
         if progress.step != self._saved:
             self._save(progress, member, CHECKPOINT, self.config.keep_checkpoints)
             self._saved = progress.step

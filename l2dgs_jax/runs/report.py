@@ -1,4 +1,4 @@
-"""report.html: a page in the run folder that shows how its training goes, and reloads itself while it does."""
+"""report.html: a page in the run folder that shows the progress of the training, and reloads itself meanwhile."""
 
 import contextlib
 import html
@@ -16,15 +16,15 @@ from l2dgs_jax.runtime.files import replacing
 from l2dgs_jax.runtime.pages import data_url, filled, script_json
 
 REPORT = "report.html"
-INTERVAL = 15  # seconds between two writings
-POINTS = 400  # of a curve, about
+WRITE_INTERVAL = 15  # seconds
+CURVE_POINTS = 400  # of a curve, about
 TEMPLATE = Path(__file__).with_name(REPORT)
 
 
 class Report:
-    """A display (see `displays`) that is such a page.
+    """A display (see `displays`) that writes the page.
 
-    What cannot be written is written the next time: no training should end for its report.
+    If the page cannot be written it is tried again the next time: no training should fail because of its report.
     """
 
     def __init__(self, folder: Path):
@@ -38,8 +38,8 @@ class Report:
         self.shown: dict[str, Any] = {"running": True, "step": 0, "left": None}
 
     def __call__(self, event: str, **facts: Any) -> None:
-        """Take it in, and write the page if that is due."""
-        if event == "stopping":  # told by another thread; the end follows
+        """Process an event, and write the page if that is due."""
+        if event == "stopping":  # reported by another thread; "end" follows
             return
         if event == "start":
             self.shown |= {"scene": facts["scene"], "run": facts["run"]}
@@ -59,7 +59,7 @@ class Report:
         if event not in ("step", "metrics") or time.monotonic() >= self.due:
             with contextlib.suppress(UserError, OSError):
                 self.write()
-            self.due = time.monotonic() + INTERVAL
+            self.due = time.monotonic() + WRITE_INTERVAL
 
     def write(self) -> None:
         """Write the page.
@@ -70,7 +70,7 @@ class Report:
         results = sorted(path.name for name in (CONTACT_SHEET, f"{VIDEO}.*") for path in self.folder.glob(name))
         content = self.shown | {
             "updated": time.time(),
-            "interval": INTERVAL,
+            "interval": WRITE_INTERVAL,
             "results": results,
             "curves": curves(self.lines),
             "views": _views(self.folder),
@@ -81,14 +81,14 @@ class Report:
 
 
 def curves(lines: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Columns of a run's metrics; of a long run's every second line, or third ..., and always the last.
+    """Columns of a run's metrics; for a long run of every second line, every third ..., and always of the last.
 
     Returns:
-        Columns "step", "loss", "psnr", "gaussians" and "memory", and by name those of "terms" (unweighted) and "rates",
-        None where a line lacks a value or has one that is not finite; and "fine", the first step of the fine stage that
-        has a line, or None.
+        Columns "step", "loss", "psnr", "gaussians" and "memory"; dictionaries of columns "terms" (unweighted) and
+        "rates"; and "fine", the first step of the fine stage that has a line, or None. Columns have None where a line
+        lacks a value or has one that is not finite.
     """
-    thinned = lines[:: -max(1, len(lines) // POINTS)][::-1]
+    thinned = lines[:: -max(1, len(lines) // CURVE_POINTS)][::-1]
     groups = {"terms": [terms(line) for line in thinned], "rates": [line.get("rates", {}) for line in thinned]}
     return {
         "step": [line["step"] for line in thinned],
@@ -107,7 +107,7 @@ def _column(lines: Sequence[dict[str, Any]], name: str) -> list[int | float | No
 
 
 def _views(folder: Path) -> list[dict[str, Any]]:
-    """The previews by view: the frame, and the pictures of every step, as data URIs."""
+    """The previews of each view as data URLs: the input frame, and the pictures of every step."""
     views: dict[str, dict[str, Any]] = {}
     for view, kind, step, path in previews.kept(folder):
         encoded = data_url(path.read_bytes(), path.name)

@@ -17,10 +17,10 @@ class Run:
     """A trained scene.
 
     Attributes:
-        config: its settings, what they left to the data filled in.
-        dataset: the scene's footage.
-        state: where its training stands.
-        folder: where it lies on disk, if it does.
+        config: its settings, resolved by `training.resolve`.
+        dataset: the frames that it was trained on, and those held out.
+        state: its training state.
+        folder: its folder on disk, if it has one.
     """
 
     config: Config
@@ -36,11 +36,11 @@ class Run:
 
     @property
     def moving(self) -> bool:
-        """Whether the state is past the coarse stage, in which nothing moves."""
+        """Whether the state is past the coarse stage, in which the motion field does not act."""
         return int(self.state.step) > self.config.coarse_steps
 
     def later(self, state: TrainState) -> "Run":
-        """The run at another state; if that has the same shapes, known sizes are not compiled again."""
+        """The run with another state; if that has the same shapes, renderers are not compiled again."""
         run = dataclasses.replace(self, state=state)
         for size, renderer in list(self._renderers.items()):  # another thread may be adding to them
             run.renderer(*size).pair_capacity = renderer.pair_capacity
@@ -49,12 +49,12 @@ class Run:
     def render(self, camera: Camera, width: int | None = None, height: int | None = None) -> RenderOutput:
         """Render one camera at its instant: well-lit and low-light image, L, R, B1, B2, alpha and depth.
 
-        Views of a new size are compiled for it once. No gradients: `model.rendering.render` has them.
+        The first image of each size compiles a renderer. There are no gradients: `model.rendering.render` has them.
 
         Args:
-            camera: one camera, `K` in pixels of the image wanted; `cameras.resize` makes other sizes of a given one.
-            width: of the image, pixels; the data set's if neither is given.
-            height: likewise.
+            camera: one camera, with `K` in pixels of the image; `cameras.resize` adapts a camera to other sizes.
+            width: of the image, pixels; that of the data set if neither is given.
+            height: of the image, pixels; that of the data set if neither is given.
 
         Raises:
             ValueError: only one of the two is given.
@@ -62,7 +62,7 @@ class Run:
         return self.renderer(width, height)(camera)
 
     def renderer(self, width: int | None = None, height: int | None = None) -> Renderer:
-        """What `render` draws images of a size with."""
+        """The renderer that `render` uses for images of a size."""
         if (width is None) != (height is None):
             raise ValueError(f"an image {width} wide and {height} high; expected both numbers, or neither")
         size = width or self.dataset.width, height or self.dataset.height

@@ -1,4 +1,4 @@
-"""Scores for people: a table of those that most look at; all of them are in the JSON."""
+"""A text table of the most common scores; the JSON output has all of them."""
 
 _COLUMNS = {
     "psnr": ("PSNR", "8.2f"),

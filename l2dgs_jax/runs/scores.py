@@ -1,4 +1,4 @@
-"""How well the views of a run match the input and, where known, the truth."""
+"""How well a run's views match the input and, where known, the ground truth."""
 
 import dataclasses
 import warnings
@@ -31,38 +31,38 @@ def evaluate(
     lpips: Mapping[Network, Lpips] | None = None,
     convention: Convention = "nsff",
 ) -> dict:
-    """Render every view of a split and compare it with the input and, where the scene has it, with the well-lit truth.
+    """Render every view of a split and compare it with the input and, if the scene has it, the well-lit ground truth.
 
-    Scores are means over the frames; docs/metrics.md defines them. A frame counts where it shows a region, and pixels
-    that are not valid are left out everywhere.
+    Scores are means over the frames; docs/metrics.md defines them. A region's means are over the frames that show it,
+    and pixels that are not valid are left out everywhere.
 
     Args:
         run: the run.
         split_name: "test" or "train".
-        lpips: weights of the networks that LPIPS is to be computed with.
+        lpips: weights of the networks to compute LPIPS with.
         convention: how regions are scored, see `metrics.compare`.
 
     Returns:
-        What can be written as JSON; None is a score that cannot be had, be it that a frame came out with values that
-        are not finite, of which a warning then tells; "area" is a region's part of the pixels of the frames that show
-        it:
+        Scores that can be written as JSON; None if a score cannot be computed, for example because a rendered frame
+        has values that are not finite, for which there is a warning. "area" is a region's share of the pixels of the
+        frames that show it.
 
         * "split", "stage", "step", "gaussians", "frames": what was scored;
-        * "region_convention": how;
-        * "lowlight_gain": "none", or if the camera's exposure drifts "own": estimates of the dark input are compared
-          with it after the gain that suits each of them best;
-        * "lowlight": "psnr" and "ssim" of the estimate of the dark input against that input, and with masks
-          "lowlight_regions", the same for "dynamic" and "static", and "mask_area", the dynamic part of all pixels;
-          where the scene says what the training views have seen, "covisible" in "lowlight_regions", as DyCheck
-          (arXiv 2210.13445) scores it. A scene learned from brightened frames (`Config.enhance`) has none of these:
-          it makes no estimate of the dark input;
-        * with truth "welllit": for "overall" and each of those regions "psnr", "ssim", "ssim_3dgs", "ms_ssim", "flip",
-          "lpips_alex" and "lpips_vgg" of the well-lit image as rendered, and the same with "_gain" after it was
-          multiplied by "gain" and clipped to [0, 1]: the one factor for all frames that, clipping included, leaves the
-          least mean squared error;
-        * with truth "dark_frame_gain": "gain", "psnr_gain" and "ssim_gain" of the dark input times its own best factor,
-          which is what knowing the exposure alone would score;
-        * "temporal": how steady the well-lit views are, see `steadiness`.
+        * "region_convention": how regions were scored;
+        * "lowlight_gain": "own" if the camera's exposure drifts, "none" otherwise: with "own", each estimate of a dark
+          frame is compared after the gain that suits it best;
+        * "lowlight": "psnr" and "ssim" of the estimate of the dark input against that input; with masks also
+          "lowlight_regions", the same for "dynamic" and "static", and "mask_area", the dynamic share of all pixels;
+          with covisibility masks also "covisible" in "lowlight_regions", scored as in DyCheck (arXiv 2210.13445). A
+          scene learned from brightened frames (`Config.enhance`) has none of these, because it makes no estimate of the
+          dark input;
+        * with ground truth, "welllit": for "overall" and each of those regions "psnr", "ssim", "ssim_3dgs", "ms_ssim",
+          "flip", "lpips_alex" and "lpips_vgg" of the well-lit image as rendered, and the same with "_gain" after it was
+          multiplied by "gain" and clipped to [0, 1]. "gain" is the factor, common to all frames, that leaves the least
+          mean squared error after clipping;
+        * with ground truth, "dark_frame_gain": "gain", "psnr_gain" and "ssim_gain" of the dark input times its own best
+          factor: what knowing only the exposure would score;
+        * "temporal": temporal stability of the well-lit views, see `steadiness`.
 
     Raises:
         UserError: the split has no views, or they have no valid pixel.
@@ -73,13 +73,13 @@ def evaluate(
     drifting = run.state.scene.params.exposures is not None
 
     def exposed(estimate: Float[np.ndarray, "H W 3"], index: int) -> Float[np.ndarray, "H W 3"]:
-        """As its frame's camera exposed it, if exposures differ: nobody has told that of frames not trained on."""
+        """The estimate at its frame's exposure; where exposures drift it is fitted, as held-out frames have no gain."""
         if not drifting:
             return estimate
         return metrics.best_gain([_counted(estimate, split.images, split, index)]) * estimate
 
     def drawn() -> Iterator[tuple[Float16[np.ndarray, "H W 3"], _Lowlight]]:
-        """The well-lit views, as compact as the data set's own, and what is kept of the low-light ones."""
+        """The well-lit views as half floats, like the data set's, and the scores of the low-light ones."""
         for index, output in enumerate(views(run, split.cameras)):
             images = output.images
             pixels = (_counted(np.asarray(x), split.images, split, index)[0] for x in (images.welllit, images.lowlight))
@@ -124,7 +124,7 @@ def evaluate(
 
 
 class _Lowlight(NamedTuple):
-    """Of a view: how its low-light image scores, and whether all of its images have values."""
+    """The scores of a view's low-light image, and whether all values of both of its images are finite."""
 
     scores: dict[str, Score]
     finite: bool
@@ -133,7 +133,7 @@ class _Lowlight(NamedTuple):
 def _apart(
     pairs: Iterator[tuple[Float16[np.ndarray, "H W 3"], T]], split: Split
 ) -> tuple[Float16[np.ndarray, "F H W 3"], list[T]]:
-    """The images as one array, in a file if those of the split are in one, and what comes with them as a list."""
+    """The images as one array, in a file if the split's images are in one, and the other items as a list."""
     others: list[T] = []
 
     def images() -> Iterator[Float16[np.ndarray, "H W 3"]]:
@@ -156,7 +156,7 @@ def _scores(
     convention: Convention,
     factor: float,
 ) -> dict[str, Score]:
-    """Scores per region of predictions times a factor."""
+    """Mean scores per region of predictions multiplied by a factor."""
 
     def compare(index: int) -> dict[str, Score]:
         prediction = np.float32(factor) * predictions[index].astype(np.float32)
@@ -166,7 +166,7 @@ def _scores(
 
 
 def _named_gain(regions: dict[str, Score]) -> dict[str, Score]:
-    """The same scores under names that say that they are after the gain; areas are left out."""
+    """The same scores with "_gain" appended to their names; areas are left out."""
     return {
         region: {f"{name}_gain": value for name, value in scores.items() if name != "area"}
         for region, scores in regions.items()
@@ -176,7 +176,7 @@ def _named_gain(regions: dict[str, Score]) -> dict[str, Score]:
 def _counted(
     prediction: Float[np.ndarray, "H W 3"], truths: Float[np.ndarray, "F H W 3"], split: Split, index: int
 ) -> tuple[Float[np.ndarray, "..."], Float[np.ndarray, "..."]]:
-    """Prediction and truth of the frame `index` where its pixels count."""
+    """Prediction and ground truth of the frame `index`, restricted to its valid pixels."""
     counted = slice(None) if split.valid is None else split.valid[index]
     return prediction[counted], truths[index][counted]
 
@@ -189,7 +189,7 @@ def _compare(
     measures: Mapping[str, Measure],
     convention: Convention,
 ) -> dict[str, Score]:
-    """Score a prediction, clipped to [0, 1], of the frame `index`, in the regions that the split marks."""
+    """Score a prediction of the frame `index`, clipped to [0, 1], in the regions that the split has masks of."""
     clipped = np.clip(np.asarray(prediction, np.float32), 0, 1)
     masks = (None if x is None else x[index] for x in (split.masks, split.valid, split.covisible))
     return metrics.compare(clipped, truths[index].astype(np.float32), *masks, measures=measures, convention=convention)

@@ -1,4 +1,4 @@
-"""What to render of a run: the views of a split, a path through its scene, or the cameras of a file."""
+"""The cameras to render of a run: the views of a split, a path through its scene, or those of a file."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -15,28 +15,28 @@ from l2dgs_jax.runs.views import get_split
 from l2dgs_jax.types import Camera
 
 FLIGHTS = ("interpolate", "spiral", "orbit", "freeze-time", "freeze-camera")
-RATE = 24  # frames a second, unless a file says otherwise
+DEFAULT_FPS = 24  # unless a file says otherwise
 
 
 class Shots(NamedTuple):
-    """Cameras and how to show what they see.
+    """Cameras to render, and names, size and frame rate of their images.
 
     Attributes:
-        title: of all of them.
-        names: of each.
+        title: of all images: the name of their folder.
+        names: of each image.
         cameras: a batch of NumPy arrays.
         size: width and height of the images that `K` is for, pixels.
-        fps: frames a second.
+        fps: frames per second of a video of them.
     """
 
     title: str
     names: tuple[str, ...]
     cameras: Camera
     size: tuple[int, int]
-    fps: float | int = RATE
+    fps: float | int = DEFAULT_FPS
 
     def resized(self, size: tuple[int, int]) -> "Shots":
-        """The same in images of another size, see `reframe`."""
+        """The same cameras for images of another size, see `reframe`."""
         return self._replace(cameras=reframe(self.cameras, self.size, size), size=size)
 
 
@@ -55,10 +55,10 @@ def of_flight(run: Run, flight: str, times: Float[np.ndarray, " T"], at: float) 
 
     Args:
         run: the run.
-        flight: one of `FLIGHTS`; "freeze-time" is the path of "interpolate" at the instant `at`, and "freeze-camera"
-            its camera of then.
+        flight: one of `FLIGHTS`; "freeze-time" is the path of "interpolate" shown at the instant `at` throughout, and
+            "freeze-camera" the camera of that path at the instant `at`, held still.
         times: instants of the cameras.
-        at: in [0, 1].
+        at: instant in [0, 1], for "freeze-time" and "freeze-camera".
     """
     trained, still = run.dataset.train.cameras, np.full(len(times), at)
     if flight == "interpolate":
@@ -79,7 +79,7 @@ def of_file(run: Run, path: Path) -> Shots:
         UserError: it cannot be read or has no cameras.
     """
     cameras, size, fps = read_camera_path(path, _size(run))
-    return Shots(path.stem, _numbered(len(cameras.time)), cameras, size, RATE if fps is None else fps)
+    return Shots(path.stem, _numbered(len(cameras.time)), cameras, size, DEFAULT_FPS if fps is None else fps)
 
 
 def _depth(run: Run) -> float:

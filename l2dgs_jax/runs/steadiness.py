@@ -1,4 +1,4 @@
-"""How steady the well-lit views of a run are from one to the next."""
+"""Temporal stability of the well-lit views of a run."""
 
 import dataclasses
 
@@ -12,25 +12,26 @@ from l2dgs_jax.training.flows import neighbour_flows
 
 
 def steadiness(welllit: Float[np.ndarray, "F H W 3"], split: Split, gain: float | None) -> dict:
-    """The warping error (arXiv 1808.00449) of views that follow each other in time, of the cameras next to each other.
+    """The warping error (arXiv 1808.00449) between each view and the one of the next instant whose camera is nearest.
 
-    It counts where optical flow there and back agree, between views that show most of the same.
+    Only pixels count at which forward and backward optical flow agree, and only pairs of views that show mostly the
+    same.
 
     Args:
         welllit: the well-lit images of the split's views.
-        split: its truth, or where there is none its dark input, is what flow is found in.
-        gain: what the images are multiplied by, before they are clipped to [0, 1], to be scored a second time; None
-            without truth, NaN if images are not finite.
+        split: the views; flow is computed on their ground truth, or without it on their dark input.
+        gain: factor on the images, before they are clipped to [0, 1], for a second score; None without ground truth,
+            NaN if images are not finite.
 
     Returns:
-        What can be written as JSON:
+        Scores that can be written as JSON:
 
-        * "flow": what it was found in, "truth" or "input";
-        * "pairs": how many views have one to follow them;
-        * "regions": for "overall", "dynamic", "static" and "covisible", as far as the split marks them,
-          "warping_error" of the images, "area", the part of the pixels that it was found in, and given a gain
-          "warping_error_gain" of the images times it and "warping_error_truth" of the truth, which is what errors of
-          the flow and changes of light amount to; each None if an image is not finite where it counts.
+        * "flow": what it was computed on, "truth" or "input";
+        * "pairs": how many pairs of views were compared;
+        * "regions": for "overall", "dynamic", "static" and "covisible", as far as the split has masks of them:
+          "warping_error" of the images; "area", the share of the pixels that were compared; and given a gain
+          "warping_error_gain" of the images times the gain and "warping_error_truth" of the ground truth, which is due
+          to errors of the flow and changes of light. A score is None if an image is not finite where it counts.
     """
     videos = {"warping_error": (welllit, 1.0)}
     source = split

@@ -1,4 +1,4 @@
-"""A training as events for TensorBoard, written by tensorboardX."""
+"""Events of a training for TensorBoard, written by tensorboardX."""
 
 from pathlib import Path
 from typing import Any
@@ -8,12 +8,12 @@ from l2dgs_jax.runs import previews
 from l2dgs_jax.runs.recorder import terms
 from l2dgs_jax.runtime.extras import extra
 
-EVENTS = "tensorboard"  # folder in that of the run
-FLUSH = 10  # seconds between writings
+EVENTS_FOLDER = "tensorboard"  # in the run folder
+FLUSH_INTERVAL = 10  # seconds
 
 
 class TensorBoard:
-    """A display (see `displays`) that leaves the metrics as scalars, and the previews as images."""
+    """A display (see `displays`) that writes the metrics as scalars and the previews as images."""
 
     def __init__(self, folder: Path):
         """Write nothing before the first event.
@@ -27,15 +27,15 @@ class TensorBoard:
         self.folder, self.library, self.writer = folder, tensorboardx(), None
 
     def __call__(self, event: str, **facts: Any) -> None:
-        """Write what the event tells."""
+        """Write the event, if it is one of metrics or previews."""
         if event in ("begin", "end") and self.writer:
             self.writer.close()
             self.writer = None
         if event == "begin":
-            # Later steps that were written are of before the run was interrupted or put back.
+            # Events of later steps are from before the run was interrupted or went back: TensorBoard should drop them.
             lost = facts["step"] + 1
             self.writer = self.library.SummaryWriter(
-                str(self.folder / EVENTS), purge_step=lost, filename_suffix=f".{lost}", flush_secs=FLUSH
+                str(self.folder / EVENTS_FOLDER), purge_step=lost, filename_suffix=f".{lost}", flush_secs=FLUSH_INTERVAL
             )
         elif event == "metrics" and self.writer:
             for name, value in _scalars(facts).items():
@@ -56,7 +56,7 @@ def tensorboardx() -> Any:
 
 
 def _scalars(line: dict[str, Any]) -> dict[str, float]:
-    """Numbers of a line of metrics by their tags."""
+    """The numbers in a line of metrics, by their TensorBoard tags."""
     found = {name: line[name] for name in ("loss", "psnr", "gaussians", "memory")}
     found |= {f"terms/{name}": value for name, value in terms(line).items()}
     found |= {f"rates/{name}": value for name, value in line["rates"].items()}

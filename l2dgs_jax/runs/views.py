@@ -1,4 +1,4 @@
-"""Views of a run, rendered one after the other."""
+"""Rendering views of a run one after the other."""
 
 from collections.abc import Iterator
 
@@ -27,7 +27,7 @@ def views(
     renderer = run.renderer(*size or (None, None))
     count = len(cameras.time)
     outputs = prefetch(lambda i: jax.device_get(renderer(select_camera(cameras, i))), range(count))
-    hidden = quiet or None  # None: where there is no terminal
+    hidden = quiet or None  # None: hidden if there is no terminal
     yield from tqdm(outputs, total=count, desc="render", unit="view", dynamic_ncols=True, disable=hidden)
 
 

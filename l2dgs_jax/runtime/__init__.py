@@ -1,1 +1,1 @@
-"""Files, threads, devices, processes and command lines: what the method itself knows nothing of."""
+"""Files, threads, devices, processes and command lines: infrastructure that is independent of the method."""

@@ -1,4 +1,4 @@
-"""Named arrays of files that others made: NumPy's .npz, or what PyTorch saved."""
+"""Named arrays from files of other programs: NumPy's .npz, or what PyTorch saved."""
 
 import io
 from collections.abc import Mapping
@@ -14,11 +14,11 @@ from l2dgs_jax.runtime.reading import read_file
 
 
 def load(path: Path, expected: str) -> Arrays:
-    """Read an .npz, or a state_dict as torch.save writes it. Nothing that a file may ask for is run.
+    """Read an .npz file, or a state_dict as torch.save writes it. No code that a file may contain is run.
 
     Args:
         path: the file.
-        expected: what it should hold, for messages.
+        expected: what an .npz file should hold, for messages.
 
     Raises:
         UserError: the file is missing, damaged, or of another kind.
@@ -31,17 +31,17 @@ def load(path: Path, expected: str) -> Arrays:
 def expect_floats(
     path: Path, arrays: Mapping[str, Shaped[np.ndarray, "..."]], name: str, shape: tuple[int, ...], expected: str
 ) -> Shaped[np.ndarray, "..."]:
-    """One of a file's arrays.
+    """One of a file's arrays, checked.
 
     Args:
         path: the file, for messages.
-        arrays: all of them.
-        name: of the one.
-        shape: that it must have.
+        arrays: all arrays of the file.
+        name: of the array.
+        shape: that the array must have.
         expected: what the file should hold, for messages.
 
     Raises:
-        UserError: it is missing, has another shape, or holds something else than finite floats.
+        UserError: the array is missing, has another shape, or holds something else than finite floats.
     """
     if name not in arrays:
         raise UserError(f"{path}: '{name}' is missing; expected {expected}")

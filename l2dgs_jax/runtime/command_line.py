@@ -16,20 +16,20 @@ from l2dgs_jax.runtime import devices
 
 T = TypeVar("T")
 
-HELP = frozenset({"-h", "--help"})
+HELP_OPTIONS = frozenset({"-h", "--help"})
 
 
 def run(
     command: Callable[[Sequence[str]], None], arguments: Sequence[str] | None = None, *, huge_pages: bool = False
 ) -> None:
-    """Run a command: whatever ends it early becomes one sentence on standard error and an exit code.
+    """Run a command; user errors and interruptions become one sentence on standard error and an exit code.
 
     Args:
         command: takes the arguments.
-        arguments: those of the command line if not given.
-        huge_pages: for commands that compute for long; makes the program start twice.
+        arguments: if not given, those of the command line.
+        huge_pages: whether to use huge pages, for commands that compute for long; the program then starts twice.
     """
-    if huge_pages and not HELP & set(sys.argv):
+    if huge_pages and not HELP_OPTIONS & set(sys.argv):
         use_huge_pages()
     devices.use_atomic_additions()
     use_compilation_cache()
@@ -49,12 +49,12 @@ def run(
 
 
 def _show_warning(message: Warning | str, *_: Any) -> None:
-    """Warnings as a sentence; where in the code one was given helps nobody who typed a command."""
+    """Show a warning as one sentence; its place in the code does not help somebody who typed a command."""
     print(f"warning: {message}", file=sys.stderr)
 
 
 def parse(kind: Callable[..., T], arguments: Sequence[str], program: str, default: T | None = None) -> T:
-    """Parse command-line arguments into the dataclass `kind`, of which a partial may settle some fields."""
+    """Parse command-line arguments into the dataclass `kind`, or a partial of it that sets defaults of some fields."""
     script = f"l2dgs {program}"
     program = script if sys.argv[0] == script else f"python -m l2dgs_jax.{program}"
     if default is None:
@@ -63,7 +63,7 @@ def parse(kind: Callable[..., T], arguments: Sequence[str], program: str, defaul
 
 
 def use_compilation_cache() -> None:
-    """Keep compiled programs in the user's cache folder; L2DGS_JAX_CACHE names another, or "off"."""
+    """Keep compiled programs in the user's cache folder; L2DGS_JAX_CACHE names another folder, or is "off"."""
     base = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
     folder = os.environ.get("L2DGS_JAX_CACHE", str(base / "l2dgs_jax"))
     if folder != "off":
@@ -72,9 +72,9 @@ def use_compilation_cache() -> None:
 
 
 def use_huge_pages() -> None:
-    """Start the program anew with glibc asking Linux for huge pages, which it can only be told at the start.
+    """Restart the program with glibc set to ask Linux for huge pages, which is only possible at the start.
 
-    XLA's temporaries are mapped anew in every step; in pages of 4 KiB that takes more than a quarter of its time.
+    Every step maps XLA's temporary buffers again; with pages of 4 KiB that takes more than a quarter of its time.
     """
     tunables = os.environ.get("GLIBC_TUNABLES", "")
     if sys.platform == "linux" and "glibc.malloc.hugetlb" not in tunables:

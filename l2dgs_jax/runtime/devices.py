@@ -1,4 +1,4 @@
-"""The devices that a training is spread over, in one process or several."""
+"""The devices that a training is spread over, in one process or in several."""
 
 import contextlib
 import importlib.util
@@ -14,29 +14,29 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, PyTree
 
-# Axes of a mesh: members of an ensemble, and views of a batch.
+# Axes of a device mesh: members of an ensemble, and views of a batch.
 MEMBERS, VIEWS = "members", "views"
 
 T = TypeVar("T")
 
 
 def one_per_core() -> None:
-    """Make every processor core a device of its own, unless the user or a caller has settled how many there are.
+    """Make every CPU core a device, unless the user or a caller has set the number of CPU devices.
 
-    XLA runs most loops of a program on one core. Two programs, each with a view of the step, keep two cores busy.
+    XLA runs most loops of a program on one core. Two programs, each with one view of the step, keep two cores busy.
     """
     chosen = jax.config.jax_num_cpu_devices  # type: ignore[attr-defined]
     if chosen < 0 and "host_platform_device_count" not in os.environ.get("XLA_FLAGS", ""):
         cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-        with contextlib.suppress(RuntimeError):  # too late: the process has used jax before
+        with contextlib.suppress(RuntimeError):  # too late: the process has already used jax
             jax.config.update("jax_num_cpu_devices", cores)
 
 
 def use_atomic_additions() -> None:
-    """On NVIDIA GPUs, have floats added to memory by one instruction; in effect only before jax has started.
+    """On NVIDIA GPUs, let XLA use atomic instructions to add floats to memory; works only before jax has started.
 
-    jaxlib before 0.11.1 otherwise adds them by loops that compare and swap (jax issue 38806), because the instruction
-    takes subnormal numbers for zero; the flag says that all of XLA may.
+    jaxlib before 0.11.1 otherwise adds them by compare-and-swap loops (jax issue 38806), because the instruction
+    flushes subnormal numbers to zero; the flag allows all of XLA to do so.
     """
     flags = os.environ.get("XLA_FLAGS", "")
     if not any(importlib.util.find_spec(f"jax_cuda{version}_plugin") for version in (12, 13)):
@@ -47,15 +47,15 @@ def use_atomic_additions() -> None:
 
 
 def shares(views: int) -> int:
-    """The most devices that share a batch of so many views evenly."""
+    """The largest number of devices that share a batch of `views` evenly."""
     return max(count for count in range(1, jax.device_count() + 1) if views % count == 0)
 
 
 def mesh(members: int = 1, views: int = 1) -> Mesh | None:
-    """`members` x `views` devices, as many of each process as can be; None for the only one of a single process.
+    """A mesh of `members` x `views` devices, taken from all processes in turn; None for one device of one process.
 
     Raises:
-        ValueError: there are not that many, or a process would be left without.
+        ValueError: there are not that many devices, or a process would be left without any.
     """
     count = members * views
     by_process = [[d for d in jax.devices() if d.process_index == p] for p in range(jax.process_count())]
@@ -71,7 +71,7 @@ def mesh(members: int = 1, views: int = 1) -> Mesh | None:
 
 
 def shard(tree: PyTree, mesh: Mesh | None, *axes: str) -> PyTree:
-    """Host arrays as arrays whose first axes are spread over those of the mesh; every process has the whole arrays."""
+    """Shard host arrays, which every process holds whole: their first axes are spread over `axes` of the mesh."""
     if mesh is None:
         return tree
     sharding = NamedSharding(mesh, PartitionSpec(*axes))
@@ -84,7 +84,7 @@ def shard(tree: PyTree, mesh: Mesh | None, *axes: str) -> PyTree:
 
 
 def member(tree: T, index: int) -> T:
-    """Row `index` of all arrays of a tree, for which this process must hold it (see `own_rows`)."""
+    """Row `index` of all arrays of a tree; this process must hold that row (see `own_rows`)."""
 
     def pick(x: Array) -> Array:
         for shard in x.addressable_shards:
@@ -97,7 +97,7 @@ def member(tree: T, index: int) -> T:
 
 
 def own_rows(array: Array) -> Iterator[int]:
-    """The rows that are this process's to report on: those that it holds and no process before it."""
+    """The rows that this process reports on: those that it holds and no process of a lower index does."""
     holders: dict[int, int] = {}
     for shard in array.global_shards:
         for index in range(*shard.index[0].indices(array.shape[0])):
@@ -106,10 +106,10 @@ def own_rows(array: Array) -> Iterator[int]:
 
 
 def mean_over(tree: T, axis: str | None) -> T:
-    """Means over the devices of an axis of `jax.shard_map`; None for a single device."""
+    """Mean over the devices of an axis of `jax.shard_map`; with `axis` None, for a single device, `tree` itself."""
     return tree if axis is None else jax.lax.pmean(tree, axis)
 
 
 def max_over(x: Array, axis: str | None) -> Array:
-    """The maximum over the devices of an axis, as `mean_over`."""
+    """Like `mean_over`, the maximum."""
     return x if axis is None else jax.lax.pmax(x, axis)

@@ -1,4 +1,4 @@
-"""Several processes that train together on `jax.distributed`, with bounded waits and a sentence for every end."""
+"""Training by several processes with `jax.distributed`: waits are bounded, and every failure is one sentence."""
 
 import contextlib
 import os
@@ -18,13 +18,13 @@ from l2dgs_jax.errors import Interrupted, UserError
 
 @dataclass(frozen=True)
 class Hosts:
-    """Several processes, one on each host. All see the same files, and all are started with the same options but one.
+    """Training on several hosts, with one process each. All see the same files and get the same options but --process.
 
     Attributes:
-        coordinator: HOST:PORT of process 0, or JAX_COORDINATOR_ADDRESS; without either there is one process only.
-        processes: how many there are, or JAX_NUM_PROCESSES.
-        process: which one this is, from 0, or JAX_PROCESS_ID.
-        timeout: seconds that the processes wait for each other when they start, end, or fall silent.
+        coordinator: HOST:PORT of process 0, for training on several hosts; JAX_COORDINATOR_ADDRESS if not given.
+        processes: number of processes; JAX_NUM_PROCESSES if not given.
+        process: index of this process, from 0; JAX_PROCESS_ID if not given.
+        timeout: seconds that the processes wait for each other when they start or end, or when one does not respond.
     """
 
     coordinator: str | None = None
@@ -35,10 +35,10 @@ class Hosts:
 
 @contextlib.contextmanager
 def process_group(hosts: Hosts) -> Iterator[None]:
-    """Join the other processes, and part from them at the end; does nothing for one process.
+    """Connect to the other processes, and disconnect at the end; does nothing for a single process.
 
-    If the others are not found or lost, or if the block raises, the process ends at once with the reason on standard
-    error, and exit code 2 unless what was raised has its own: it would wait for the others, or they for it.
+    If the others are not found or are lost, or if the block raises, the process ends at once, because it would wait for
+    the others or they for it. The reason goes to standard error; the exit code is 2, or that of the exception.
 
     Raises:
         UserError: an option is missing or malformed.
@@ -63,12 +63,12 @@ def process_group(hosts: Hosts) -> Iterator[None]:
         "this training has lost one of its processes, or the way to it; expected all of them to run to the end: start "
         "all again with --resume"
     )
-    with _last_words() as prepare:
+    with _message_if_killed() as prepare:
         prepare(alone)
-        # Past its own limit jaxlib ends the process with a stack trace: ours comes first.
-        patience = threading.Timer(hosts.timeout, _leave, [prepare, f"error: {alone}"])
-        patience.daemon = True
-        patience.start()
+        # At its own limit jaxlib ends the process with a stack trace; this timer comes first.
+        timer = threading.Timer(hosts.timeout, _exit_at_once, [prepare, f"error: {alone}"])
+        timer.daemon = True
+        timer.start()
         jax.distributed.initialize(
             address,
             count,
@@ -78,24 +78,24 @@ def process_group(hosts: Hosts) -> Iterator[None]:
             shutdown_timeout_seconds=hosts.timeout,
             cluster_detection_method="deactivate",
         )
-        patience.cancel()
+        timer.cancel()
         prepare(lost)
         try:
             yield
         except UserError as error:
-            _leave(prepare, f"error: {error}", error.code)
+            _exit_at_once(prepare, f"error: {error}", error.code)
         except Interrupted as stop:
-            _leave(prepare, str(stop), stop.code)
+            _exit_at_once(prepare, str(stop), stop.code)
         except BaseException as error:
-            # A broken connection comes as a ValueError too.
+            # A broken connection is sometimes raised as a ValueError.
             if isinstance(error, jax.errors.JaxRuntimeError) or "Gloo" in str(error):
-                _leave(prepare, f"error: {lost} ({str(error).splitlines()[0]})")
-            _leave(prepare, f"error: {''.join(traceback.format_exception(error))}")
+                _exit_at_once(prepare, f"error: {lost} ({str(error).splitlines()[0]})")
+            _exit_at_once(prepare, f"error: {''.join(traceback.format_exception(error))}")
         jax.distributed.shutdown()
 
 
 def barrier(name: str) -> None:
-    """Wait until all processes have come to the barrier of that name."""
+    """Wait until all processes have reached the barrier of that name."""
     if jax.process_count() > 1:
         multihost_utils.sync_global_devices(name)
 
@@ -109,8 +109,8 @@ def _number(option: str, value: int | None, variable: str) -> int:
     return int(text)
 
 
-def _leave(prepare: Callable[[str], None], sentence: str, code: int = 2) -> None:
-    """End at once: the usual end would wait for processes that may be gone."""
+def _exit_at_once(prepare: Callable[[str], None], sentence: str, code: int = 2) -> None:
+    """End the process without cleaning up, which would wait for processes that may be gone."""
     prepare("")
     sys.stdout.flush()
     print(sentence, file=sys.stderr, flush=True)
@@ -118,16 +118,17 @@ def _leave(prepare: Callable[[str], None], sentence: str, code: int = 2) -> None
 
 
 @contextlib.contextmanager
-def _last_words() -> Iterator[Callable[[str], None]]:
-    """A function that prepares the sentence to be printed if this process is ended from outside or by jaxlib.
+def _message_if_killed() -> Iterator[Callable[[str], None]]:
+    """A function that sets the sentence to be printed if this process is killed or ended by jaxlib.
 
-    jaxlib ends a process whose coordinator is lost from a thread of its own, and Python never hears of it.
+    jaxlib ends a process that has lost its coordinator from a thread of its own, without notice to Python. So a child
+    process prints the sentence.
     """
     program = "import sys; last = sys.stdin.read().splitlines()[-1]; last and print('error:', last, file=sys.stderr)"
     command = [sys.executable, "-I", "-S", "-c", program]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, text=True, start_new_session=True) as witness:
-        assert witness.stdin is not None
-        pipe = witness.stdin
+    with subprocess.Popen(command, stdin=subprocess.PIPE, text=True, start_new_session=True) as child:
+        assert child.stdin is not None
+        pipe = child.stdin
 
         def prepare(sentence: str) -> None:
             pipe.write(f"{sentence}\n")

@@ -1,4 +1,4 @@
-"""Packages that are not part of the plain installation."""
+"""Optional packages, which pip installs with an extra of this one."""
 
 import importlib
 from typing import Any
@@ -7,15 +7,15 @@ from l2dgs_jax.errors import UserError
 
 
 def extra(package: str, name: str, use: str) -> Any:
-    """Import a package of an extra.
+    """Import an optional package.
 
     Args:
         package: to import.
-        name: of the extra in pyproject.toml.
-        use: what the extra is for.
+        name: of the extra in pyproject.toml that installs it.
+        use: what the extra is for, for the message.
 
     Raises:
-        UserError: it is not installed.
+        UserError: the package is not installed.
     """
     try:
         return importlib.import_module(package)

@@ -12,12 +12,12 @@ from typing import Any
 
 from l2dgs_jax.errors import DISK_FULL, UserError
 
-FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # the disk, the user's share of it, or the limit of a file
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # the disk or the user's quota is full, or the file too large
 
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A temporary file beside `path` to write to; it takes the place of `path` if the block ends without an error.
+    """A temporary file beside `path` to write to; it replaces `path` if the block ends without an error.
 
     Raises:
         UserError: the folder is missing or not writable, or `path` is a folder.
@@ -37,7 +37,7 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def append_line(path: Path, line: str) -> None:
-    """Add a line to a file. Whoever reads it must bear with a last line that is torn.
+    """Add a line to a file. After a crash its last line may be incomplete, which readers must tolerate.
 
     Raises:
         UserError: the file cannot be written.
@@ -50,7 +50,7 @@ def append_line(path: Path, line: str) -> None:
 
 
 def flush(path: Path) -> None:
-    """Have a file, or what a folder lists, on the disk itself, where a power cut leaves it whole."""
+    """Force a file, or a folder's list of entries, onto the disk, so that it survives a power cut."""
     descriptor = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)
     try:
         os.fsync(descriptor)
@@ -59,17 +59,17 @@ def flush(path: Path) -> None:
 
 
 def unwritable(path: Path, error: OSError) -> UserError:
-    """What to raise where the system refuses to write."""
-    if error.errno in FULL:
+    """The error to raise where the system refuses to write."""
+    if error.errno in NO_ROOM:
         return UserError(f"{path}: cannot be written ({error.strerror}); expected more room", DISK_FULL)
     return UserError(f"{path}: cannot be written ({error.strerror}); expected a writable folder")
 
 
 def make_folder(path: Path) -> None:
-    """Make a folder and those above it, unless they exist.
+    """Create a folder and its parents, unless they exist.
 
     Raises:
-        UserError: it cannot be made.
+        UserError: it cannot be created.
     """
     try:
         path.mkdir(parents=True, exist_ok=True)
@@ -82,7 +82,7 @@ def new_folder(path: Path) -> Iterator[Path]:
     """A temporary folder beside `path` to fill; it becomes `path` if the block ends without an error.
 
     Raises:
-        UserError: `path` exists and is no empty folder, or its place is not writable.
+        UserError: `path` exists and is not an empty folder, or cannot be written.
     """
     expect_new(path)
     target = path.absolute()
@@ -102,13 +102,13 @@ def new_folder(path: Path) -> Iterator[Path]:
 
 
 def write_json(path: Path, content: Any) -> None:
-    """Write what JSON can hold, whole or not at all, making the folder that it goes to.
+    """Write a JSON file, whole or not at all, and create its folder.
 
     Numbers that JSON lacks become the strings "Infinity", "-Infinity" and "NaN", as in the JSON of Protocol Buffers;
     Python's `float` reads them.
 
     Raises:
-        UserError: the folder cannot be made, or else as `replacing`.
+        UserError: the folder cannot be created, or as `replacing`.
     """
     make_folder(path.parent)
     with replacing(path) as temporary:
@@ -122,20 +122,20 @@ def _spelled_out(content: Any) -> Any:
     if isinstance(content, list | tuple):
         return [_spelled_out(value) for value in content]
     if isinstance(content, float) and not math.isfinite(content):
-        return json.dumps(content)  # these names, which are JavaScript's
+        return json.dumps(content)  # writes these names, which are JavaScript's
     return content
 
 
 def is_taken(path: Path) -> bool:
-    """Whether something is there already, other than an empty folder."""
+    """Whether `path` exists and is not an empty folder."""
     return path.exists() and (not path.is_dir() or any(path.iterdir()))
 
 
 def expect_new(path: Path) -> None:
-    """Complain early of what `new_folder` would complain of.
+    """Check early what `new_folder` requires of `path`.
 
     Raises:
-        UserError: `path` exists and is no empty folder.
+        UserError: `path` exists and is not an empty folder.
     """
     if path.is_symlink() or is_taken(path):
         raise UserError(f"{path}: exists already; expected a new or an empty folder to write to")

@@ -1,4 +1,4 @@
-"""A folder that one process at a time works in."""
+"""Locks on folders, so that one process at a time works in each."""
 
 import contextlib
 import os
@@ -19,10 +19,10 @@ LOCK = "lock"
 
 @contextlib.contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Keep other processes that ask for the same out of a folder for the length of the block.
+    """Hold the lock of a folder for the length of the block.
 
-    The lock is the system's, which drops it with the process, however that ends; the empty file `lock` only carries it.
-    Where the system or the folder's file system has none, a warning says so.
+    It is a lock of the operating system, which releases it when the process ends, however that happens; the empty file
+    `lock` only carries it. If the system or the file system does not support locks, a warning says so.
 
     Raises:
         UserError: another process holds the lock, or the folder cannot be written to.

@@ -1,4 +1,4 @@
-"""Memory: how much is in use, and running out of it, said in one sentence."""
+"""How much memory is in use, and one-sentence errors for running out of it."""
 
 import contextlib
 import os
@@ -9,27 +9,27 @@ import jax
 
 from l2dgs_jax.errors import OUT_OF_MEMORY, UserError
 
-STATISTICS = Path("/proc/self/statm")  # of Linux: pages of the process, the resident ones second
+STATM = Path("/proc/self/statm")  # Linux: numbers of this process's memory pages, the resident ones second
 
 
 def memory_in_use() -> int | None:
-    """Bytes: of the first device where devices keep account, or else of this process; None where nothing tells."""
+    """Bytes in use on the first device if it reports them, or else by this process; None if neither is known."""
     device = jax.local_devices()[0].memory_stats()
     if device:
         return device["bytes_in_use"]
     try:
-        return int(STATISTICS.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+        return int(STATM.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
     except OSError:
         return None
 
 
 @contextlib.contextmanager
 def memory_errors(reached: Callable[[], str], expected: str) -> Iterator[None]:
-    """Turn running out of memory, of the host or of a device, into a sentence.
+    """Turn running out of memory, on the host or on a device, into a `UserError`.
 
     Args:
-        reached: how far the work has come, asked when it fails.
-        expected: what would take less.
+        reached: called on failure; says how far the work has come.
+        expected: what would take less memory.
 
     Raises:
         UserError: the memory does not suffice.

@@ -1,4 +1,4 @@
-"""NumPy arrays in nested dictionaries, as flax's users pickle parameters: nothing that a pickle may ask for is run."""
+"""Pickled nested dictionaries of NumPy arrays, as flax's users save parameters; no code in a pickle is run."""
 
 import io
 import re
@@ -11,27 +11,27 @@ from jaxtyping import Shaped
 from l2dgs_jax.runtime.pickles import Arrays, follow
 from l2dgs_jax.runtime.reading import RefusedError, read_file
 
-_LONGEST_NAME = 256  # a long name would be repeated for every array below it
+_LONGEST_NAME = 256  # characters; a longer name would be repeated for every array below it
 
 
 def load(path: Path) -> Arrays:
-    """Read a pickled dictionary of arrays, or of such dictionaries.
+    """Read a pickled dictionary whose values are arrays or, again, such dictionaries.
 
     Args:
         path: the file, of protocol 3 or 4.
 
     Returns:
-        The arrays in the file's order, each with memory of its own, by the keys that lead to it with / between them.
+        The arrays in the file's order, each with memory of its own, by their keys joined with /.
 
     Raises:
         UserError: the file is missing, damaged, or holds something else.
     """
-    read = lambda content: _flat(follow(io.BytesIO(content), _NAMES, reusable=(_Type,)), "")
+    read = lambda content: _flat(follow(io.BytesIO(content), _STAND_INS, reusable=(_Type,)), "")
     return read_file(path, read, "a dictionary of pickled arrays")
 
 
 class _Described:
-    """What a pickle says of an object: the arguments that make it, and the state that completes it."""
+    """Stands in for an object of a pickle: the arguments of its constructor, and its state."""
 
     def __init__(self, *arguments: Any):
         self.arguments = arguments
@@ -48,7 +48,7 @@ class _Type(_Described):
     pass
 
 
-_NAMES = {
+_STAND_INS = {
     f"{module} {name}": stand_in
     for module in ("numpy", "numpy.core.multiarray", "numpy._core.multiarray")
     for name, stand_in in (("_reconstruct", _Array), ("dtype", _Type), ("ndarray", "an argument of _reconstruct"))

@@ -1,4 +1,4 @@
-"""What pages of HTML that hold all they show have in common."""
+"""Helpers for self-contained HTML pages, which hold everything that they show."""
 
 import base64
 import json
@@ -8,15 +8,15 @@ from typing import Any
 
 
 def filled(template: str, **parts: str) -> str:
-    """A template with something in the place of every hole; that of `part` is written __PART__."""
+    """A template with every placeholder replaced: __NAME__ by the part called `name`."""
     return re.sub("__([A-Z_]+?)__", lambda hole: parts[hole[1].lower()], template)
 
 
 def script_json(data: Any) -> str:
-    """JSON that can stand in a script element: nothing in it ends the element."""
+    """JSON that is safe inside a script element: nothing in it can end the element."""
     return json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")
 
 
 def data_url(content: bytes, name: str) -> str:
-    """A picture or video as an address that holds it; the ending of `name` says what it is."""
+    """A data URL that holds a picture or video; the suffix of `name` gives its type."""
     return f"data:{mimetypes.guess_type(name)[0]};base64,{base64.b64encode(content).decode()}"

@@ -1,6 +1,6 @@
-"""Pickled arrays without `pickle`: the few instructions that they need are followed here.
+"""Reading pickled arrays without `pickle`: an interpreter of the few instructions that they need.
 
-`pickle` itself, even with no classes at hand, can be led to exhaust the stack or the memory.
+`pickle` itself can be made to exhaust the stack or the memory, even if it may load no classes.
 """
 
 import io
@@ -18,9 +18,9 @@ Arrays = dict[str, Shaped[np.ndarray, "..."]]
 _NUMBERS = ("BININT", "BININT1", "BININT2", "LONG1", "BINFLOAT")
 _TEXTS = ("BINUNICODE", "SHORT_BINUNICODE", "BINSTRING", "SHORT_BINSTRING", "BINBYTES", "SHORT_BINBYTES")
 _CONSTANTS = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False, "EMPTY_TUPLE": ()}
-# Of values that an instruction takes from the stack; the others take all since the last mark.
-_COUNTS = {"TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3, "APPEND": 1, "SETITEM": 2, "STACK_GLOBAL": 2, "REDUCE": 2}
-_SHORT = 64  # characters or bytes of what a file may mention again instead of writing it twice
+# How many values an instruction takes from the stack; those not listed take all since the last mark.
+_OPERANDS = {"TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3, "APPEND": 1, "SETITEM": 2, "STACK_GLOBAL": 2, "REDUCE": 2}
+_LONGEST_REUSED = 64  # characters or bytes of a text that a pickle may refer to again
 
 
 def follow(
@@ -29,28 +29,29 @@ def follow(
     reusable: tuple[type, ...] = (),
     persistent: Callable[[Any], Any] | None = None,
 ) -> Any:
-    """What the next pickle of a stream describes; the stream is left behind its end.
+    """The object that the next pickle of a stream describes; the stream is left after its end.
 
-    It is made of dictionaries, lists, tuples, numbers, text and bytes, and of what `names` and `persistent` give. Only
-    short text and what is `reusable` can be in two places: a small file could become a large object otherwise.
+    It consists of dictionaries, lists, tuples, numbers, text and bytes, and of what `names` and `persistent` return.
+    Only short text and values of the types in `reusable` may be referred to more than once: otherwise a small file
+    could become a large object.
 
     Args:
-        stream: holds the pickle, and maybe more.
-        names: what stands for each "module name" that the pickle may mention; functions and classes may be called. What
-            they make is completed by its own `__setstate__`.
-        reusable: types of what is made so, whose values may be mentioned again.
-        persistent: gives what stands for a persistent id; without it there may be none.
+        stream: holds the pickle, and possibly more after it.
+        names: what stands in for each "module name" that the pickle may load. The pickle can call stand-ins that are
+            functions or classes; it then passes the objects' states to their `__setstate__`.
+        reusable: types of objects so made that the pickle may refer to more than once.
+        persistent: returns what stands in for a persistent id; None if there may be no such ids.
 
     Raises:
-        RefusedError: the pickle asks for more.
-        Exception: any other; the pickle is damaged.
+        RefusedError: the pickle needs anything else.
+        Exception: of any other type, if the pickle is damaged.
     """
     stack: list[Any] = []
     marks: list[int] = []
     memo: dict[int, Any] = {}
 
     def taken(instruction: str) -> list[Any]:
-        count = _COUNTS[instruction] if instruction in _COUNTS else len(stack) - marks.pop()
+        count = _OPERANDS[instruction] if instruction in _OPERANDS else len(stack) - marks.pop()
         return [stack.pop() for _ in range(count)][::-1]
 
     argument: Any
@@ -83,7 +84,7 @@ def follow(
                 memo[len(memo)] = stack[-1]
             case "BINGET" | "LONG_BINGET":
                 value = memo[argument]
-                short = isinstance(value, str | bytes) and len(value) <= _SHORT
+                short = isinstance(value, str | bytes) and len(value) <= _LONGEST_REUSED
                 if not (short or callable(value) or isinstance(value, reusable)):
                     raise RefusedError("holds one value in two places")
                 stack.append(value)
@@ -92,12 +93,12 @@ def follow(
                 if asked not in names:
                     raise RefusedError(f"asks to load {asked.replace(' ', '.')[:80]!r} (nothing was run)")
                 stack.append(names[asked])
-            case "REDUCE":  # only `names` has brought anything onto the stack that can be called
+            case "REDUCE":  # whatever is callable on the stack comes from `names`
                 function, arguments = taken(name)
                 stack.append(function(*arguments))
             case "BUILD":
                 state = stack.pop()
-                if not isinstance(stack[-1], dict):  # whose state is the attributes of an OrderedDict
+                if not isinstance(stack[-1], dict):  # the state of an OrderedDict is only its attributes
                     stack[-1].__setstate__(state)
             case "BINPERSID" if persistent:
                 stack.append(persistent(stack.pop()))
@@ -108,7 +109,7 @@ def follow(
 
 
 def dictionary(items: Iterable[Any] = ()) -> dict[str, Any]:
-    """A dictionary of pairs, the keys of which must be text: another could be nested too deep to be hashed."""
+    """A dictionary of pairs whose keys must be text: other keys could be nested too deep to be hashed."""
     pairs = [(key, value) for key, value in items]
     if not all(isinstance(key, str) for key, _ in pairs):
         raise RefusedError("holds something else")

@@ -1,4 +1,4 @@
-"""Work a little ahead of its use, on threads."""
+"""Computing results a little ahead of their use, on threads."""
 
 from collections import deque
 from collections.abc import Callable, Generator, Iterable
@@ -10,9 +10,9 @@ U = TypeVar("U")
 
 
 def prefetch(function: Callable[[T], U], items: Iterable[T], workers: int = 2) -> Generator[U, None, None]:
-    """`map`, a few items at once in threads: what one of them leaves idle of a processor, the next one uses.
+    """`map` with a few items at once in threads, so that one item uses the cores that another leaves idle.
 
-    At most `workers` results wait beside the one that is next. An error is raised where its result would have come; the
+    At most `workers` results wait besides the next one. An error is raised where its result would have come. The
     threads end with the iterator, also when it is closed early.
     """
     with ThreadPoolExecutor(workers) as pool:

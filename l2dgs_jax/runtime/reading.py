@@ -1,4 +1,4 @@
-"""Files that others made: what a reader makes of their bytes, or one sentence on why it makes nothing of them."""
+"""Reading files of other programs, with one-sentence errors for those that cannot be read."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -10,15 +10,15 @@ T = TypeVar("T")
 
 
 class RefusedError(Exception):
-    """What a sound file holds that is not supported; the message lacks the file's name and what was expected."""
+    """An undamaged file holds something unsupported; the message lacks the file's name and what was expected."""
 
 
 def read_file(path: Path, read: Callable[[bytes], T], expected: str) -> T:
-    """What `read` makes of the bytes of a file.
+    """The result of `read` for the bytes of a file.
 
     Args:
         path: the file.
-        read: may raise anything.
+        read: turns the bytes into a value; may raise anything.
         expected: what the file should hold, for messages.
 
     Raises:
@@ -32,5 +32,5 @@ def read_file(path: Path, read: Callable[[bytes], T], expected: str) -> T:
         return read(content)
     except RefusedError as refusal:
         raise UserError(f"{path}: {refusal}; expected {expected}") from None
-    except Exception:  # damaged files raise whatever their bytes lead to
+    except Exception:  # damaged files can raise anything
         raise UserError(f"{path}: damaged or of another kind; expected {expected}") from None

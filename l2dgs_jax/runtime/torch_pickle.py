@@ -1,7 +1,7 @@
-"""Tensors that PyTorch saved, as NumPy arrays: without PyTorch, and without running what a pickle may ask for.
+"""Tensors saved by PyTorch as NumPy arrays: without PyTorch, and without running code from the pickle.
 
-`torch.save` pickles an object in which every tensor is a view of a storage named by a key. The bytes of the storages
-lie beside the pickle in a zip archive, or, before PyTorch 1.6, behind it in the same file ("legacy").
+`torch.save` pickles an object in which every tensor is a view of a storage, named by a key. The bytes of the storages
+are other entries of the same zip archive or, before PyTorch 1.6, follow the pickle in the same file ("legacy").
 """
 
 import io
@@ -31,14 +31,14 @@ _DTYPES = {
     "ByteStorage": "<u1",
     "BoolStorage": "?",
 }
-_DIMENSIONS = 64  # at most, of an array of NumPy
-_SHARED = 4  # times its size that the tensors of a file may fill where they share storages
+_MOST_DIMENSIONS = 64  # of a NumPy array
+_LARGEST_EXPANSION = 4  # of all tensors, which may share storages, over the size of the file
 
 
 def load(path: Path) -> Arrays:
     """Read a dictionary of tensors, such as `torch.save(model.state_dict(), path)` writes, in either format.
 
-    The pickle can build dictionaries, lists and tensors, and nothing else; whatever more it asks for is refused.
+    The pickle can build dictionaries, lists and tensors; anything else is refused.
 
     Args:
         path: the file. Devices that it names are ignored.
@@ -70,13 +70,13 @@ class _Tensor(NamedTuple):
 def _read(content: bytes) -> Arrays:
     tensors, storages = (_read_zip if content.startswith(_ZIP_START) else _read_legacy)(content)
     filled = sum(math.prod(tensor.shape) * np.dtype(tensor.storage.dtype).itemsize for tensor in tensors.values())
-    if filled > _SHARED * len(content):
+    if filled > _LARGEST_EXPANSION * len(content):
         raise RefusedError("holds tensors that together are many times larger than the file")
     return {name: _array(tensor, storages[tensor.storage.key]) for name, tensor in tensors.items()}
 
 
 def _read_zip(content: bytes) -> tuple[dict[str, _Tensor], dict[str, bytes]]:
-    """The tensors and the bytes of their storages, by key."""
+    """The tensors by name, and the bytes of their storages by key."""
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
         (name,) = (name for name in archive.namelist() if name.endswith("/data.pkl"))
         folder = name.removesuffix("data.pkl")
@@ -91,7 +91,7 @@ def _read_zip(content: bytes) -> tuple[dict[str, _Tensor], dict[str, bytes]]:
 
 
 def _read_legacy(content: bytes) -> tuple[dict[str, _Tensor], dict[str, bytes]]:
-    """The same of a legacy file: magic number, version, system, object and list of keys, then all storages."""
+    """Like `_read_zip`, for a legacy file: magic number, version, system, object, list of keys, and the storages."""
     stream = io.BytesIO(content)
     magic, version, system = (follow(stream, {}) for _ in range(3))
     if (magic, version) != (_LEGACY_MAGIC, _LEGACY_VERSION):
@@ -102,7 +102,7 @@ def _read_legacy(content: bytes) -> tuple[dict[str, _Tensor], dict[str, bytes]]:
     storages = _storages(tensors)
     raw = {}
     for key in follow(stream, {}):
-        if not isinstance(key, str):  # it could be nested too deep to be looked up
+        if not isinstance(key, str):  # other keys could be nested too deep to be hashed
             raise ValueError("not the key of a storage")
         count = int.from_bytes(stream.read(8), "little")
         raw[key] = stream.read(count * np.dtype(storages[key].dtype).itemsize)
@@ -110,7 +110,7 @@ def _read_legacy(content: bytes) -> tuple[dict[str, _Tensor], dict[str, bytes]]:
 
 
 def _tensors(stream: io.BytesIO) -> dict[str, _Tensor]:
-    saved = follow(stream, _NAMES, reusable=(_Tensor,), persistent=_storage)
+    saved = follow(stream, _STAND_INS, reusable=(_Tensor,), persistent=_storage)
     if not isinstance(saved, dict) or not all(isinstance(tensor, _Tensor) for tensor in saved.values()):
         raise RefusedError("holds something else")
     return saved
@@ -121,7 +121,7 @@ def _storages(tensors: dict[str, _Tensor]) -> dict[str, _Storage]:
 
 
 def _storage(reference: Any) -> _Storage:
-    """Stands for the storage that a persistent id refers to."""
+    """The storage that a persistent id refers to."""
     kind, dtype, key, _device, count, *view = reference
     known = kind == "storage" and dtype in _DTYPES.values() and isinstance(key, str) and _natural([count])
     if not known or view not in ([], [None]):
@@ -130,18 +130,18 @@ def _storage(reference: Any) -> _Storage:
 
 
 def _tensor(storage: Any, offset: Any, shape: Any, strides: Any, *_: Any) -> _Tensor:
-    """Stands for PyTorch's `_rebuild_tensor_v2`; the view must lie within its storage."""
-    sound = isinstance(storage, _Storage) and len(shape) == len(strides) <= _DIMENSIONS
+    """Stands in for PyTorch's `_rebuild_tensor_v2`; the view must lie within its storage."""
+    sound = isinstance(storage, _Storage) and len(shape) == len(strides) <= _MOST_DIMENSIONS
     if not sound or not _natural([offset, *shape, *strides]):
         raise ValueError("not the arguments of a tensor")
     last = offset + sum((size - 1) * stride for size, stride in zip(shape, strides, strict=True))
-    # Repeated elements (stride 0) could make a small file fill the memory; no weights are saved so.
+    # Repeated elements (stride 0) could make a small file fill the memory; weights are not saved like that.
     if 0 not in shape and (last >= storage.elements or math.prod(shape) > storage.elements):
         raise ValueError("a tensor larger than its storage")
     return _Tensor(storage, offset, tuple(shape), tuple(strides))
 
 
-_NAMES = {
+_STAND_INS = {
     "collections OrderedDict": dictionary,
     "torch._utils _rebuild_tensor_v2": _tensor,
     **{f"torch {storage}": dtype for storage, dtype in _DTYPES.items()},

@@ -1,1 +1,1 @@
-"""Studies of many trainings: what is to be trained, what can be trained together, and what came out."""
+"""Studies of many trainings: their specification, what can be trained together, and the results."""

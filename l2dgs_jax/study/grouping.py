@@ -15,7 +15,7 @@ from l2dgs_jax.training import resolve
 
 @dataclass(frozen=True)
 class Trial:
-    """A member of a study with its data loaded and its settings resolved."""
+    """A member of a study with its data loaded and its settings resolved by `training.resolve`."""
 
     plan: Plan
     dataset: Dataset
@@ -23,13 +23,13 @@ class Trial:
 
 
 def load_groups(spec: Spec) -> list[list[Trial]]:
-    """Load every scene once and put those members together that one program can train.
+    """Load every scene once, and group the members that one program can train.
 
-    Members of a group have images of one size, planes of one size, and settings that differ in nothing but the
-    numbers of `overrides.TRACED`.
+    Members of a group have images and planes of the same size, and settings that differ only in the numbers of
+    `overrides.TRACED`.
 
     Raises:
-        UserError: a scene cannot be read, or the study insists on one program and there cannot be one.
+        UserError: a scene cannot be read, or the study requires one program and its members need several.
     """
     datasets: dict[tuple, Dataset] = {}
     groups: dict[tuple, list[Trial]] = {}

@@ -1,4 +1,4 @@
-"""What came out of a study: one table of all members, as JSON, as Markdown and as plots."""
+"""The results of a study: a table of all members as JSON and as Markdown, and plots."""
 
 import json
 import math
@@ -10,8 +10,8 @@ from l2dgs_jax import runs
 from l2dgs_jax.runtime.files import replacing, write_json
 
 JSON, MARKDOWN, PLOTS = "results.json", "results.md", "results.png"
-RESULT = "result.json"  # in the folder of a member
-FINISHED = "finished"  # how a member ended that did not diverge
+RESULT_FILE = "result.json"  # in the folder of a member
+FINISHED = "finished"  # "ended" of a member that did not diverge
 
 _SCORES = {
     "low-light PSNR": ("lowlight", "psnr"),
@@ -23,12 +23,12 @@ _SCORES = {
 
 
 def write(folder: Path, names: Sequence[str]) -> list[str]:
-    """Collect the members' results in the study's folder; the names of the files written.
+    """Collect the members' results in the study's folder; returns the names of the files written.
 
     Raises:
         UserError: the folder cannot be written to.
     """
-    members = [{"name": name, **json.loads((folder / name / RESULT).read_text())} for name in names]
+    members = [{"name": name, **json.loads((folder / name / RESULT_FILE).read_text())} for name in names]
     write_json(folder / JSON, {"members": members})
     with replacing(folder / MARKDOWN) as temporary:
         temporary.write_text(markdown(members))
@@ -67,7 +67,7 @@ def _text(value: Any) -> str:
 
 
 def _plot(path: Path, members: Sequence[dict[str, Any]], folder: Path) -> None:
-    """The members' loss and low-light PSNR while they trained, and their scores side by side."""
+    """Plot the members' low-light PSNR during training, and their final PSNRs side by side."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(15, max(4, 0.3 * len(members))), layout="constrained")

@@ -1,4 +1,4 @@
-"""All members of a study trained, scored and tabulated."""
+"""Training, scoring and tabulating all members of a study."""
 
 import json
 from collections.abc import Iterator, Sequence
@@ -22,18 +22,18 @@ from l2dgs_jax.study.spec import Plan, Spec
 from l2dgs_jax.training import DivergedError, Member, Progress, engine
 from l2dgs_jax.visualize import contact_sheet
 
-PLANS = "study.json"  # the members that OUT holds
-DIVERGED = "diverged.json"  # in the folder of a member that is frozen
+PLANS_FILE = "study.json"  # in the study's folder: its members
+DIVERGED_FILE = "diverged.json"  # in the folder of a member that has diverged and is frozen
 
 
 def run_study(spec: Spec, output: Path, *, resume: bool = False, device_count: int | None = None) -> list[str]:
-    """Train, score and tabulate all members of a study, together with the other processes if there are some.
+    """Train, score and tabulate all members of a study, together with the other processes if there are any.
 
     Args:
-        spec: of `study.spec.read`.
+        spec: from `study.spec.read`.
         output: the study's folder.
-        resume: go on with what the folder holds.
-        device_count: how many devices the members of a group are spread over, at most one each; None for all.
+        resume: whether to continue the study in the folder.
+        device_count: number of devices to spread the members of a group over, at most one per member; None for all.
 
     Returns:
         Names of the files in `output` that compare the members.
@@ -61,9 +61,9 @@ def run_study(spec: Spec, output: Path, *, resume: bool = False, device_count: i
 
 
 def _claim(output: Path, plans: Sequence[Plan], resume: bool) -> None:
-    """Write what the folder is for, or compare it with what it was for."""
+    """Record the study's members in its folder, or check that they are those recorded."""
     described = [{"name": p.name, "scene": p.scene, "settings": to_dict(p.config)} for p in plans]
-    path = output / PLANS
+    path = output / PLANS_FILE
     if resume:
         try:
             held = json.loads(path.read_text())
@@ -88,12 +88,12 @@ def _mesh(group: Sequence[Trial], device_count: int) -> Mesh | None:
 
 
 def _train(group: Sequence[Trial], output: Path, mesh: Mesh | None) -> None:
-    """Train what is neither finished nor frozen, from where it stands."""
+    """Train the members that are neither finished nor frozen, from their last checkpoints."""
     members: dict[str, Member] = {}
     pair_capacity: int | None = None
     for trial in group:
         folder, config = output / trial.plan.name, trial.config
-        if (folder / DIVERGED).exists():
+        if (folder / DIVERGED_FILE).exists():
             continue
         state, needed, _ = runs.last_checkpoint(folder, trial.dataset, config)
         pair_capacity = max(needed or 0, pair_capacity or 0) or None
@@ -120,7 +120,7 @@ def _train(group: Sequence[Trial], output: Path, mesh: Mesh | None) -> None:
 
 
 def _steps(members: Sequence[Member], pair_capacity: int | None, mesh: Mesh | None) -> Iterator[Progress]:
-    """The steps of a training, also the one after which no member is left."""
+    """The steps of a training, including the one at which the last member diverges."""
     try:
         yield from engine.run(members, pair_capacity, mesh)
     except DivergedError as error:
@@ -128,7 +128,7 @@ def _steps(members: Sequence[Member], pair_capacity: int | None, mesh: Mesh | No
 
 
 class _Follower:
-    """Records one member in its folder and shows how it goes, until it diverges."""
+    """Records one member in its folder and shows its progress, until it diverges."""
 
     def __init__(self, folder: Path, member: Member, index: int):
         self.folder, self.index, self.done = folder, index, int(member.state.step)
@@ -149,24 +149,24 @@ class _Follower:
             self.bar.set_postfix_str(f"{line['psnr']:.1f} dB, {line['gaussians']} Gaussians")
 
     def _freeze(self, progress: Progress) -> None:
-        """Keep the last state that could be trusted, and say what was found after it."""
+        """Save the last state before the divergence, and the loss terms of the diverged step."""
         self.record.checkpoint(progress, self.index)
         terms = devices.member(progress.report.terms, self.index)
         found = {"step": progress.step - 1, "terms": {name: str(float(value)) for name, value in terms.items()}}
-        write_json(self.folder / DIVERGED, found)
+        write_json(self.folder / DIVERGED_FILE, found)
         self.bar.set_postfix_str(f"diverged at step {found['step']}, frozen")
 
 
 def _score(trial: Trial, output: Path) -> None:
-    """Score a trained member, unless that was done before the study was interrupted."""
+    """Score a trained member, unless it already was."""
     folder, config = output / trial.plan.name, trial.config
-    path = folder / report.RESULT
+    path = folder / report.RESULT_FILE
     if path.exists():
         return
     state = runs.last_checkpoint(folder, trial.dataset, config).state
     run = Run(config, trial.dataset, state, folder)
     write_image(folder / runs.CONTACT_SHEET, contact_sheet(run))
-    diverged = (folder / DIVERGED).exists()
+    diverged = (folder / DIVERGED_FILE).exists()
     result = {
         "scene": trial.plan.scene,
         "variant": trial.plan.variant,

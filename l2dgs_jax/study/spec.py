@@ -1,4 +1,4 @@
-"""The file that describes a study, and the members that it stands for."""
+"""The TOML file that describes a study, and the members that it defines."""
 
 import itertools
 import tomllib
@@ -18,11 +18,11 @@ class Plan:
     """A member of a study before anything is loaded.
 
     Attributes:
-        name: unique, fit for a folder's name.
-        variant: name of the variant that it is of; empty if there are none.
-        scene: its folder, or "demo".
+        name: unique, and usable as the name of a folder.
+        variant: name of its variant; empty if there are none.
+        scene: folder of its scene, or "demo".
         config: its settings.
-        varied: the settings that the study varies, by dotted name, with this member's values, and its "preset" if the
+        varied: this member's values of the settings that the study varies, by dotted name, and its "preset" if the
             variant has one of its own.
     """
 
@@ -35,7 +35,7 @@ class Plan:
 
 @dataclass(frozen=True)
 class Spec:
-    """A study: its members, and whether it insists that one compiled program trains them all."""
+    """A study: its members, and whether one compiled program must train them all."""
 
     plans: tuple[Plan, ...]
     one_program: bool
@@ -44,17 +44,17 @@ class Spec:
 def read(path: Path, scenes: Sequence[str] = ()) -> Spec:
     """Read a study from a TOML file.
 
-    Its keys: `scenes` (folders, seen from the file's own, or "demo"), `seeds` ([0] if not given), `preset` ("default"),
-    `[settings]` for all members, `[grid]` with a list of values for each setting, of which every combination is a
-    member, `[[variants]]` with a `name` and settings each, if need be with a `preset` of their own, and `one_program`.
-    Members are all scenes x seeds x combinations x variants.
+    Its keys: `scenes` (folders relative to that of the file, or "demo"), `seeds` ([0] if not given), `preset`
+    ("default" if not given), `[settings]` for all members, `[grid]` with a list of values for each setting, all
+    combinations of which are trained, `[[variants]]`, each with a `name`, settings and optionally a `preset` of its
+    own, and `one_program`. The members are all scenes x seeds x combinations x variants.
 
     Args:
         path: the file.
-        scenes: in place of those in the file: absolute paths, or "demo".
+        scenes: replace those in the file: absolute paths, or "demo".
 
     Raises:
-        UserError: the file cannot be read, or a key or value in it is none of these.
+        UserError: the file cannot be read, or has an unknown key or an invalid value.
     """
     content = _read_toml(path)
     unknown = sorted(content.keys() - set(KEYS))
@@ -90,11 +90,11 @@ def _read_toml(path: Path) -> dict[str, Any]:
     except OSError as error:
         raise UserError(f"{path}: cannot be read ({error.strerror}); expected a TOML file") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise UserError(f"{path}: is no TOML ({error}); expected a file like the one in docs/studies.md") from None
+        raise UserError(f"{path}: is not TOML ({error}); expected a file like the one in docs/studies.md") from None
 
 
 def _list(path: Path, content: dict[str, Any], key: str, kind: type) -> list:
-    """The distinct values of a list that must hold some, all of one type."""
+    """The values of a list, which must have at least one, all distinct and of one type."""
     values: Any = content.get(key)
     name = {str: "names", int: "whole numbers from 0 below 2^31"}[kind]
 
@@ -111,7 +111,7 @@ def _scene(path: Path, scene: str) -> str:
 
 
 def _flat(table: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested tables by dotted names."""
+    """Nested tables flattened to dotted names."""
     flat: dict[str, Any] = {}
     for key, value in table.items():
         flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
@@ -134,7 +134,7 @@ def _checked(path: Path, key: str, name: str, value: Any) -> Any:
 
 
 def _grid(path: Path, table: Any) -> list[dict[str, Any]]:
-    """Every combination of the values that the settings of a table have."""
+    """Every combination of the values in a table that lists values for each setting."""
     if not isinstance(table, dict):
         raise UserError(f"{path}: grid is {table!r}; expected a table with a list of values for each setting")
     columns = []
@@ -152,7 +152,7 @@ def _preset(path: Path, name: Any) -> str:
 
 
 def _variants(path: Path, tables: Any) -> list[tuple[str, str | None, dict[str, Any]]]:
-    """Names of the variants, their own presets if any, and their settings; a single nameless one if there are none."""
+    """Name, preset of its own (or None) and settings of each variant; a single nameless variant if there are none."""
     if tables == [{}]:
         return [("", None, {})]
     named = isinstance(tables, list) and all(isinstance(t, dict) and isinstance(t.get("name"), str) for t in tables)
@@ -168,7 +168,7 @@ def _variants(path: Path, tables: Any) -> list[tuple[str, str | None, dict[str, 
 
 
 def _labels(point: dict[str, Any]) -> list[str]:
-    """What a combination is called in a folder's name."""
+    """A combination of settings as parts of a folder's name."""
 
     def text(value: Any) -> str:
         return "_".join(map(str, value)) if isinstance(value, tuple) else str(value)

@@ -1,4 +1,4 @@
-"""What training sees in which step."""
+"""Which views each training step sees."""
 
 from typing import Any
 
@@ -20,7 +20,7 @@ def next_batch(split: Split, config: Config, step: int, flows: Flows | None) -> 
         split: frames to learn from.
         config: seed, batch size, and the share of views between frames.
         step: of the run, from 0.
-        flows: between the frames; None if all views are to be frames.
+        flows: optical flow between the frames; None if no view is to lie between frames.
     """
     seed = int(config.seed)
     indices = view_indices(seed, step, config.batch_size, len(split.names))
@@ -29,23 +29,23 @@ def next_batch(split: Split, config: Config, step: int, flows: Flows | None) -> 
         return batch
     valid = np.ones(batch.images.shape[:-1], bool) if batch.valid is None else batch.valid
     rows: Any = (*batch.cameras, batch.images, valid)
-    shares = _shares_between(split, flows, config.inbetweens)
-    chances, parts = np.random.default_rng((seed % 2**64, step, 1)).random((2, config.batch_size))
+    probabilities = _probabilities_between(split, flows, config.inbetweens)
+    uniforms, parts = np.random.default_rng((seed % 2**64, step, 1)).random((2, config.batch_size))
     for row, frame in enumerate(indices.tolist()):
-        if chances[row] < shares[frame]:
+        if uniforms[row] < probabilities[frame]:
             view = draw(split, flows, frame, float(parts[row]))
             for stack, own in zip(rows, (*view.camera, view.image, view.valid), strict=True):
                 stack[row] = own
             if batch.depths is not None:
-                batch.depths[row] = 0  # nobody knows it between frames
+                batch.depths[row] = 0  # the depth is not known between frames
     return batch._replace(valid=valid)  # type: ignore[arg-type]
 
 
-def _shares_between(split: Split, flows: Flows, share: float) -> Float[np.ndarray, " F"]:
-    """How often each frame gives way to a view between it and the following one.
+def _probabilities_between(split: Split, flows: Flows, share: float) -> Float[np.ndarray, " F"]:
+    """Probability that each frame is replaced by a view between it and the following one.
 
-    The longer the time between them, the more can happen in it: the odds are those of `share` for the mean of such
-    times, and in proportion to them. A frame that none follows never does.
+    The longer the time between them, the more can happen in it: the odds are proportional to it, and those of `share`
+    at its mean over the frames. They are 0 for a frame that none follows.
     """
     times = np.asarray(split.cameras.time, np.float64)
     gaps = times[flows.following] - times
@@ -64,10 +64,10 @@ def load_batch(split: Split, indices: Int[np.ndarray, " V"]) -> Batch:
 
 
 def view_indices(seed: int, step: int, batch_size: int, num_frames: int) -> Int[np.ndarray, " B"]:
-    """The views of one training step.
+    """The frames of one training step.
 
-    All steps together read an endless row of random permutations of the frames, `batch_size` at a time: every epoch
-    shows each frame once, whether or not the batch size divides the number of frames. A pure function of its
+    All steps together read an endless sequence of random permutations of the frames, `batch_size` at a time: every
+    epoch shows each frame once, whether or not the batch size divides the number of frames. A pure function of its
     arguments, so a resumed run sees what the uninterrupted one would have.
 
     Args:

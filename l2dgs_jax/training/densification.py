@@ -32,7 +32,7 @@ class Densified(NamedTuple):
         alive: which rows exist.
         changed: rows that were written or died: their optimizer state and statistics start anew.
         wanted: free rows that were needed.
-        missing: how many of those there were not; the caller grows the capacity and calls again.
+        missing: how many of these were lacking; if any, the caller grows the capacity and calls again.
     """
 
     gaussians: Gaussians
@@ -55,7 +55,7 @@ def accumulate(
     Args:
         stats: so far.
         probe_gradient: dL/d(mean2d) in pixels, summed over the views.
-        radii: the largest in any view, pixels; 0 where it was not drawn.
+        radii: of each Gaussian, the largest in any view, pixels; 0 if it was not drawn.
         width: pixels.
         height: pixels.
     """
@@ -65,7 +65,7 @@ def accumulate(
 
 
 def most_gaussians(cfg: DensityConfig) -> Int[Array, ""] | int:
-    """The largest number that may exist; "auto" is resolved by then."""
+    """The largest number of Gaussians that may exist; "auto" is resolved by then."""
     return cfg.max_gaussians  # type: ignore[return-value]
 
 
@@ -77,7 +77,7 @@ def densify(
     key: PRNGKeyArray,
     cfg: DensityConfig,
 ) -> Densified:
-    """Prune transparent Gaussians, then clone the small and split the large ones of large screen-space gradients.
+    """Prune transparent Gaussians, then clone small and split large ones among those of large screen-space gradients.
 
     A clone leaves its source alone; a split moves the source to one sample of itself and a new row to another, both
     smaller. If `cfg.max_gaussians` leaves too few rows, those with the largest gradients win. Nothing here is
@@ -94,8 +94,8 @@ def densify(
     budget = jnp.maximum(most_gaussians(cfg) - alive_kept.sum(), 0)
     wanted = jnp.minimum(underfitting.sum(), budget)
 
-    by_need = jnp.argsort(jnp.where(underfitting, -mean_gradient, jnp.inf))
-    rank = jnp.argsort(by_need)
+    by_gradient = jnp.argsort(jnp.where(underfitting, -mean_gradient, jnp.inf))
+    rank = jnp.argsort(by_gradient)
     chosen = underfitting & (rank < jnp.minimum(wanted, free))
     free_rows = jnp.nonzero(~alive_kept, size=capacity, fill_value=capacity)[0]
     target = jnp.where(chosen, free_rows[rank], capacity)  # row `capacity` does not exist: the write is dropped
@@ -103,8 +103,8 @@ def densify(
     split = chosen & (jnp.exp(gaussians.log_scales).max(-1) > cfg.clone_below * extent)
     if cfg.conserve_opacity:
         # Two Gaussians of opacity 1 - sqrt(1 - o), one behind the other, cover what one of opacity o did.
-        let_through = jnp.sqrt(jax.nn.sigmoid(-gaussians.logit_opacities))
-        shared = jnp.log1p(-let_through) - jnp.log(let_through)
+        transmittance = jnp.sqrt(jax.nn.sigmoid(-gaussians.logit_opacities))
+        shared = jnp.log1p(-transmittance) - jnp.log(transmittance)
         gaussians = gaussians._replace(logit_opacities=jnp.where(chosen, shared, gaussians.logit_opacities))
     first, second = (_sample(gaussians, split, k) for k in jax.random.split(key))
     written = jax.tree.map(lambda old, new: old.at[target].set(new, mode="drop"), first, second)

@@ -28,7 +28,7 @@ from l2dgs_jax.types import Scene
 
 T = TypeVar("T")
 
-MARGIN = 1.3  # of the pair buffer over what was last needed: every size is a compilation
+MARGIN = 1.3  # size of the pair buffer over the pairs last needed: every new size costs a compilation
 
 
 class Member(NamedTuple):
@@ -66,8 +66,8 @@ class DivergedError(ArithmeticError):
 def run(members: Sequence[Member], pair_capacity: int | None = None, mesh: Mesh | None = None) -> Iterator[Progress]:
     """Train all members to the end, coarse stage then fine, by one program, yielding after every step.
 
-    A member begins where its state stands, once the others have come that far. If its loss or gradient is not finite
-    it stays as it was before that step, and the others go on.
+    A member joins at the step that its state has reached. If its loss or gradient is not finite it stays as it was
+    before that step, and the others go on.
 
     Args:
         members: their settings may differ in the numbers of `overrides.TRACED`, their states in the number of rows.
@@ -78,12 +78,12 @@ def run(members: Sequence[Member], pair_capacity: int | None = None, mesh: Mesh 
         DivergedError: no member is left.
     """
     config, start = members[0].config, min(int(member.state.step) for member in members)
-    rows, shares = (mesh.shape[MEMBERS], mesh.shape[VIEWS]) if mesh else (1, 1)
-    views = config.batch_size // shares
+    member_shards, view_shards = (mesh.shape[MEMBERS], mesh.shape[VIEWS]) if mesh else (1, 1)
+    views = config.batch_size // view_shards
     pair_capacity = pair_capacity or max(first_capacity(m.split, m.state.scene, views) for m in members)
-    # Every device has as many members; those that fill the last ones up wait for a step that never comes.
-    waiting = members[0]._replace(state=members[0].state._replace(step=jnp.asarray(-1, jnp.int32)))
-    members = [*members, *[waiting] * (-len(members) % rows)]
+    # Every device needs equally many members; those added as padding wait for step -1, which never comes.
+    padding = members[0]._replace(state=members[0].state._replace(step=jnp.asarray(-1, jnp.int32)))
+    members = [*members, *[padding] * (-len(members) % member_shards)]
     states = devices.shard(_stack_states([member.state for member in members]), mesh, MEMBERS)
     static, columns = overrides.partition([member.config for member in members])
     values = devices.shard({name: _stack(column) for name, column in columns.items()}, mesh, MEMBERS)
@@ -122,7 +122,7 @@ class Tally(NamedTuple):
     """What all processes must agree on after a step.
 
     Attributes:
-        pairs: the most pairs that a member needs which was to take the step.
+        pairs: the largest number of pairs that a member needs, among those that were to take the step.
         left: number of members that have taken it or are past it.
     """
 
@@ -149,7 +149,7 @@ def train_steps(
         batches: likewise.
         values: the settings in which members differ, by dotted name, stacked.
         step: its number.
-        config: all other settings, with holes for those.
+        config: all other settings, with placeholders for those.
         moving: whether it is a step of the fine stage.
         pair_capacity: size of each member's pair buffer.
         mesh: see `run`.
@@ -184,7 +184,7 @@ def begin_fine_stage(
 def densify_all(
     states: TrainState, values: dict[str, Any], step: int, growths: int, *, config: StaticConfig, mesh: Mesh | None
 ) -> TrainState:
-    """`densify` for every member that has come to that step, all moving up the ladder when one runs out of rows."""
+    """`densify` for every member that has come to that step; if one runs out of rows, the capacity of all grows."""
     while True:
         grown, rows = _densify_all(states, values, step, growths, config=config, mesh=mesh)
         if not rows:
@@ -218,16 +218,16 @@ _with_capacity = partial(jax.jit, static_argnums=1)(jax.vmap(with_capacity, (0, 
 
 
 def _each_member(function: Callable, mesh: Mesh | None, common: PyTree, *trees: PyTree) -> Any:
-    """`function(common, *rows)` of every row of the trees."""
+    """`function(common, *rows)` for the rows of every member in the trees."""
     platform = (mesh.devices.flat[0] if mesh else jax.devices()[0]).platform
 
     def here(common: PyTree, *trees: PyTree) -> Any:
-        """Of the rows that this device has."""
+        """For the members that this device holds."""
         each = partial(function, common)
         if len(jax.tree.leaves(trees)[0]) == 1:
             return jax.tree.map(lambda x: x[None], each(*jax.tree.map(lambda x: x.squeeze(0), trees)))
         if platform == "cpu":
-            # One member keeps all cores busy; side by side they take 1.4 times as long, out of the caches.
+            # One member keeps all cores busy; batched by vmap they miss the caches and take 1.4 times as long.
             return jax.lax.map(lambda rows: each(*rows), trees)
         return jax.vmap(each)(*trees)
 
@@ -256,7 +256,7 @@ def _complaint(report: StepReport, step: int) -> str:
 
 
 def first_capacity(split: Split, scene: Scene, views: int) -> int:
-    """A pair buffer for the first views, the Gaussians at rest, with a margin for the others."""
+    """Size of a pair buffer for the first views, with undeformed Gaussians, and a margin for the other views."""
     gaussians = scene.params.gaussians
     batch = load_batch(split, np.arange(views) % len(split.names))
     cameras = jax.tree.map(lambda x: jnp.asarray(x, gaussians.means.dtype), batch.cameras)
@@ -268,7 +268,7 @@ def first_capacity(split: Split, scene: Scene, views: int) -> int:
 
 
 def growths_left(stage_step: int, stage_steps: int, config: Config) -> int:
-    """How often the stage grows from its step of that number on, this one included."""
+    """How many densifications the stage has left from its step of that number on, this one included."""
     return (min(config.density.stop - 1, stage_steps) - stage_step) // config.density.interval + 1
 
 

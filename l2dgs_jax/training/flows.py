@@ -1,4 +1,4 @@
-"""Optical flow from frame to frame of a video: what views between frames, and tracks, are made of."""
+"""Optical flow from frame to frame of a video, from which views between frames and tracks are made."""
 
 from typing import NamedTuple
 
@@ -13,17 +13,17 @@ from l2dgs_jax.data.stacks import MappedArray, stacked
 from l2dgs_jax.runtime.prefetch import prefetch
 from l2dgs_jax.types import Camera
 
-SIZES = 0.5, 0.25, 0.125  # of pictures, over the frames', that show where to what is not found in these
-RETURNED = 1.5  # pixels from its start within which flow there and back must end to be trusted
-UNEXPLAINED = 0.8  # part of a picture's variance that may remain where the other is taken for it
+SMOOTH_FLOW_SIZES = 0.5, 0.25, 0.125  # of downscaled frames, in which smooth flow finds what patches lose
+MAX_FORWARD_BACKWARD_ERROR = 1.5  # pixels; flow of a larger error is not trusted
+MAX_UNEXPLAINED = 0.8  # share of a frame's variance that warping the other may leave; more means a cut between them
 
 
 class Flows(NamedTuple):
     """Optical flow between neighbouring frames.
 
     Attributes:
-        following: the frame after each one; itself where flow cannot tell.
-        displacements: pixels, from a frame to the following one and back again; NaN where they cannot be trusted.
+        following: the frame after each one; itself if there is none or the flow to it is not usable.
+        displacements: pixels, from a frame to the following one and back again; NaN where they are not trusted.
     """
 
     following: Int[np.ndarray, " F"]
@@ -31,29 +31,29 @@ class Flows(NamedTuple):
 
 
 def neighbour_flows(split: Split, *, filled: bool = False) -> Flows:
-    """Optical flow between frames that follow each other in time, of the cameras that are next to each other.
+    """Optical flow between frames that follow each other in time; with several cameras, the nearest one.
 
     Args:
         split: the frames.
-        filled: look for what patches lose by smooth flow, in smaller and smaller pictures.
+        filled: whether smooth flow, at smaller and smaller sizes, fills in where patches find no flow to trust.
     """
     following, greys = _following(split.cameras), brightened(split.images)
 
-    def both_ways(frame: int) -> Float16[np.ndarray, "2 H W 2"]:
+    def both_directions(frame: int) -> Float16[np.ndarray, "2 H W 2"]:
         first, second = greys[frame], greys[following[frame]]
-        found = _trusted(optical_flow(first, second), optical_flow(second, first))
-        for size in SIZES if filled else ():
-            more = _trusted(smooth_flow(first, second, size), smooth_flow(second, first, size))
-            found = np.where(np.isfinite(found), found, more)
-        alike = _explains(first, second, found[0]) and _explains(second, first, found[1])
-        return (found if alike else np.full_like(found, np.nan)).astype(np.float16)
+        found = _consistent(optical_flow(first, second), optical_flow(second, first))
+        for size in SMOOTH_FLOW_SIZES if filled else ():
+            smooth = _consistent(smooth_flow(first, second, size), smooth_flow(second, first, size))
+            found = np.where(np.isfinite(found), found, smooth)
+        same_scene = _explains(first, second, found[0]) and _explains(second, first, found[1])
+        return (found if same_scene else np.full_like(found, np.nan)).astype(np.float16)
 
     frames = range(len(greys))
     shape = (len(greys), 2, *greys.shape[1:], 2)
     in_file = isinstance(split.images, MappedArray)
-    displacements = stacked(prefetch(both_ways, frames), shape, np.float16, in_file)
-    told = [bool(np.isfinite(flow).any()) for flow in displacements]
-    return Flows(np.where(told, following, frames), displacements)
+    displacements = stacked(prefetch(both_directions, frames), shape, np.float16, in_file)
+    usable = [bool(np.isfinite(flow).any()) for flow in displacements]
+    return Flows(np.where(usable, following, frames), displacements)
 
 
 def _following(cameras: Camera) -> Int[np.ndarray, " F"]:
@@ -68,21 +68,24 @@ def _following(cameras: Camera) -> Int[np.ndarray, " F"]:
     return np.array([after(frame) for frame in range(len(times))])
 
 
-def _trusted(there: Float32[np.ndarray, "H W 2"], back: Float32[np.ndarray, "H W 2"]) -> Float32[np.ndarray, "2 H W 2"]:
-    """Both of them, each NaN where the other does not lead back."""
-    errors = np.stack([match(there, back).errors, match(back, there).errors])
-    return np.where(errors[..., None] < RETURNED, np.stack([there, back]), np.float32(np.nan))
+def _consistent(
+    forward: Float32[np.ndarray, "H W 2"], backward: Float32[np.ndarray, "H W 2"]
+) -> Float32[np.ndarray, "2 H W 2"]:
+    """Both flows, each NaN where its forward-backward error is too large."""
+    errors = np.stack([match(forward, backward).errors, match(backward, forward).errors])
+    trusted = errors[..., None] < MAX_FORWARD_BACKWARD_ERROR
+    return np.where(trusted, np.stack([forward, backward]), np.float32(np.nan))
 
 
 def _explains(
     first: UInt8[np.ndarray, "H W"], second: UInt8[np.ndarray, "H W"], flow: Float32[np.ndarray, "H W 2"]
 ) -> bool:
-    """Whether the second picture, where flow finds it, tells enough of the first, so that the two show one scene.
+    """Whether the second frame, warped by the flow, predicts the first well enough for both to show the same scene.
 
-    Smooth flow leads there and back between any two pictures, after a cut as well.
+    Forward-backward errors do not tell: smooth flow is consistent between any two frames, even across a cut.
     """
     known = np.isfinite(flow[..., 0])
     at = np.where(known[..., None], flow, 0) + pixel_indices(*first.shape)
-    seen = cv2.remap(second.astype(np.float32), at[..., 0], at[..., 1], cv2.INTER_LINEAR)
-    left = first - np.where(known, seen, first.mean())
-    return bool(known.any() and np.square(left).mean() <= UNEXPLAINED * first.var())
+    warped = cv2.remap(second.astype(np.float32), at[..., 0], at[..., 1], cv2.INTER_LINEAR)
+    residual = first - np.where(known, warped, first.mean())
+    return bool(known.any() and np.square(residual).mean() <= MAX_UNEXPLAINED * first.var())

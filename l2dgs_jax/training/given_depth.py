@@ -1,13 +1,13 @@
-"""How far rendered depth is from depth that came with the scene, of which scale and shift are not known."""
+"""How far rendered depth is from depth that came with the scene, whose scale and shift are unknown."""
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-OPAQUE = 0.5  # alpha from which a pixel has a depth
-TOLERANCE = 0.02  # of the mean inverse depth, up to which differences count as squares
-FLAT = 1e-4  # of the mean: depth that varies no more than that says nothing
-ROUNDS = 20  # of the search for scale and shift
+MIN_ALPHA = 0.5  # accumulated opacity above which a pixel has a depth
+HUBER_DELTA = 0.02  # of the mean inverse depth: differences below it count quadratically, above it linearly
+MIN_DEVIATION = 1e-4  # standard deviation, over the mean, below which given inverse depth counts as constant
+FIT_ITERATIONS = 20  # of reweighted least squares for scale and shift
 
 
 def depth_disagreement(
@@ -15,9 +15,9 @@ def depth_disagreement(
 ) -> Float[Array, ""]:
     """Mean robust difference of inverse depths, each view's given ones at their best scale and shift.
 
-    Inverse depth is what networks guess (MiDaS, arXiv 1907.01341), and far things differ little in it, as they should.
-    Differences are parts of the view's mean inverse depth and count by their size (pseudo-Huber), so that edges in the
-    wrong place do not decide. Pixels without depth add nothing to the mean over all.
+    Inverse depth is what networks predict (MiDaS, arXiv 1907.01341), and errors of far things count little in it, as
+    they should. Differences are relative to the view's mean inverse depth and robust (pseudo-Huber), so that misplaced
+    edges do not dominate. Pixels without depth add 0 to the mean over all pixels.
 
     Gradients flow to `depth` and `alpha`, whose quotient is a ray's depth however opaque it is. Scale and shift are
     held constant: where they are best the loss does not change with them.
@@ -27,31 +27,31 @@ def depth_disagreement(
         alpha: accumulated opacity.
         given: depth in any unit, 0 where unknown.
     """
-    known = (given > 0) & (jax.lax.stop_gradient(alpha) > OPAQUE)
+    known = (given > 0) & (jax.lax.stop_gradient(alpha) > MIN_ALPHA)
     rendered = _over_mean(jnp.where(known, alpha / jnp.where(known, depth, 1), 0), known)
-    told = _over_mean(jnp.where(known, 1 / jnp.where(known, given, 1), 0), known)
-    aim = jax.lax.stop_gradient(rendered)
+    given_inverse = _over_mean(jnp.where(known, 1 / jnp.where(known, given, 1), 0), known)
+    target = jax.lax.stop_gradient(rendered)
 
     def fitted(weights: Float[Array, "V H W"]) -> Float[Array, "V H W"]:
-        """What is told, brought as near to the rendered by weighted least squares as a scale >= 0 and a shift can."""
+        """Given inverse depths at the scale >= 0 and shift that fit the rendered ones best (weighted least squares)."""
 
         def mean(values: Float[Array, "V H W"]) -> Float[Array, "V 1 1"]:
             return (weights * values).sum((1, 2), keepdims=True) / jnp.maximum(weights.sum((1, 2), keepdims=True), 1e-6)
 
-        offset = told - mean(told)
-        scale = mean(offset * (aim - mean(aim))) / jnp.maximum(mean(offset**2), FLAT**2)
-        return mean(aim) + jnp.maximum(scale, 0) * offset
+        offset = given_inverse - mean(given_inverse)
+        scale = mean(offset * (target - mean(target))) / jnp.maximum(mean(offset**2), MIN_DEVIATION**2)
+        return mean(target) + jnp.maximum(scale, 0) * offset
 
     def reweighted(_: int | Int[Array, ""], weights: Float[Array, "V H W"]) -> Float[Array, "V H W"]:
-        return jnp.where(known, 1 / jnp.sqrt(1 + ((aim - fitted(weights)) / TOLERANCE) ** 2), 0)
+        return jnp.where(known, 1 / jnp.sqrt(1 + ((target - fitted(weights)) / HUBER_DELTA) ** 2), 0)
 
-    weights = jax.lax.fori_loop(0, ROUNDS, reweighted, known.astype(depth.dtype))
-    difference = (rendered - fitted(weights)) / TOLERANCE
-    return TOLERANCE * jnp.where(known, jnp.sqrt(1 + difference**2) - 1, 0).mean()
+    weights = jax.lax.fori_loop(0, FIT_ITERATIONS, reweighted, known.astype(depth.dtype))
+    difference = (rendered - fitted(weights)) / HUBER_DELTA
+    return HUBER_DELTA * jnp.where(known, jnp.sqrt(1 + difference**2) - 1, 0).mean()
 
 
 def _over_mean(values: Float[Array, "V H W"], counted: Bool[Array, "V H W"]) -> Float[Array, "V H W"]:
-    """Values, 0 where they do not count, as parts of the view's mean of those that do."""
+    """Values, which are 0 where they do not count, over the view's mean of those that do."""
     count = jnp.maximum(counted.sum((1, 2), keepdims=True), 1).astype(values.dtype)
     mean = values.sum((1, 2), keepdims=True) / count
     return values / jnp.where(mean > 0, mean, 1)

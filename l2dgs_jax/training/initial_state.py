@@ -20,16 +20,16 @@ from l2dgs_jax.training.state import TrainState
 from l2dgs_jax.training.step import begin_stage
 from l2dgs_jax.training.surfaces import find_surfaces
 
-GAUSSIANS_PER_PIXEL = (0.6, 1.0)  # of a frame: the bounds of what the number of views allows
-VIEWS_PER_GAUSSIAN = 40  # of a pixel: with fewer, more Gaussians fit noise
-MOST_GAUSSIANS = 360_000  # however large the frames
-DRIFT = 0.05  # standard deviation of the logarithms of the frames' gains from which exposure counts as drifting
+GAUSSIANS_PER_PIXEL = (0.6, 1.0)  # of a frame: least and greatest, in between in proportion to the number of views
+VIEWS_PER_GAUSSIAN = 40  # needed for one Gaussian per pixel: with fewer views, as many Gaussians would fit noise
+MAX_GAUSSIANS = 360_000  # however large the frames
+EXPOSURE_DRIFT = 0.05  # standard deviation of the frames' log gains above which exposure counts as drifting
 
 
 def split_darkening(split: Split, config: Config) -> Darkening:
-    """How the frames are darker than `config.loss.exposure_level`; not at all where low light is not modelled.
+    """The power law that darkens images of level `config.loss.exposure_level` to the frames.
 
-    Where it is a tone curve, they are darker than they would be with a flat histogram.
+    With tone curves it darkens images of flat histograms instead; where low light is not modelled it changes nothing.
     """
     if config.model.decomposition == "none":
         return Darkening(1.0, 1.0)
@@ -41,7 +41,7 @@ def split_darkening(split: Split, config: Config) -> Darkening:
 
 
 def resolve(config: Config, dataset: Dataset) -> Config:
-    """The settings with what they leave to the data filled in from points and training frames.
+    """The settings with what they leave to the data ("auto") determined from points and training frames.
 
     Raises:
         UserError: the frames are black.
@@ -50,9 +50,9 @@ def resolve(config: Config, dataset: Dataset) -> Config:
     if split.mean_level == 0:
         raise UserError(f"{dataset.name}: all its training frames are black; expected frames that show something")
     if config.density.max_gaussians == "auto":
-        config = overrides.replace(config, {"density.max_gaussians": _most_gaussians(split)})
+        config = overrides.replace(config, {"density.max_gaussians": _max_gaussians(split)})
     if config.model.exposure == "auto":
-        drift = exposures(dataset.points, split.cameras, split.images, split.valid).std(0).max() > DRIFT
+        drift = exposures(dataset.points, split.cameras, split.images, split.valid).std(0).max() > EXPOSURE_DRIFT
         config = overrides.replace(config, {"model.exposure": "drifting" if drift else "steady"})
     if config.model.tone == "auto":
         config = overrides.replace(config, {"model.tone": recognise(split.images, split.valid)})
@@ -74,10 +74,10 @@ def resolve(config: Config, dataset: Dataset) -> Config:
     return dataclasses.replace(config, model=model)
 
 
-def _most_gaussians(split: Split) -> int:
+def _max_gaussians(split: Split) -> int:
     views, height, width = split.images.shape[:3]
     per_pixel = np.clip(views / VIEWS_PER_GAUSSIAN, *GAUSSIANS_PER_PIXEL)
-    return min(round(per_pixel * height * width), MOST_GAUSSIANS)
+    return min(round(per_pixel * height * width), MAX_GAUSSIANS)
 
 
 def initial_state(dataset: Dataset, config: Config) -> TrainState:
@@ -92,11 +92,12 @@ def initial_state(dataset: Dataset, config: Config) -> TrainState:
     points, colors = points[order], None if colors is None else colors[order]
     seeds = None
     if config.model.tracks:
-        seeds = find_seeds(dataset.points, train, most=_most_gaussians(train))  # depths of what moves suit these
+        # Not the added points: the nearest ones of so many are too near to give the depth of what moves.
+        seeds = find_seeds(dataset.points, train, most=_max_gaussians(train))
     capacity = len(points) + (0 if seeds is None else len(seeds.points))
     if config.density.start < config.density.stop:
-        most = max(int(config.density.max_gaussians), capacity)
-        capacity = most if config.density.method == "mcmc" else next_capacity(min(1.5 * capacity, most))
+        limit = max(int(config.density.max_gaussians), capacity)
+        capacity = limit if config.density.method == "mcmc" else next_capacity(min(1.5 * capacity, limit))
     reflectance = None
     if config.model.reflectance_init == "observed":
         law = split_darkening(train, config)
@@ -114,7 +115,7 @@ def initial_state(dataset: Dataset, config: Config) -> TrainState:
 
 
 def state_shapes(config: Config, num_frames: int) -> TrainState:
-    """Shapes and types of a training's states, but for the number of Gaussians, which is 1; nothing is computed.
+    """Shapes and types of a training's states, except that the number of Gaussians is 1; nothing is computed.
 
     Args:
         config: its settings.

@@ -1,6 +1,6 @@
 """The training objective (Eqs. 10-15), one pure function per term.
 
-Every term is a mean over pixels and views; a mean over no pixel at all (differences of a one-pixel image) is 0.
+Every term is a mean over pixels and views; an empty mean (differences in a one-pixel image) is 0.
 """
 
 from collections.abc import Callable
@@ -147,7 +147,7 @@ def depth_smoothness(
         depth: D, world units.
         image: I_w.
         gradient: forward differences, or unnormalised 3x3 Sobel filters with zeros beyond the image (the authors').
-            The image's is the mean over channels of absolute values.
+            The image gradient is averaged over channels in absolute value.
     """
 
     def smoothness(step: Float[Array, "..."], edge: Float[Array, "..."]) -> Scalar:
@@ -191,7 +191,7 @@ def total_variation(image: Float[Array, "*B H W"]) -> Scalar:
 
 
 def exponent_prior(attenuation: Float[Array, "*B H W 2"], target: Scalar | float) -> Scalar:
-    """Mean |B1 - target|: keeps the colours of the well-lit image from drifting with the exponent of R_w."""
+    """Mean |B1 - target|: keeps the colours of the well-lit image from drifting along with the exponent of R_w."""
     return jnp.abs(attenuation[..., 0] - target).mean()
 
 
@@ -204,7 +204,7 @@ def _forward(image: Float[Array, "*B H W C"]) -> tuple[Float[Array, "*B H W_1 C"
 
 
 def _central(image: Float[Array, "*B H W C"]) -> tuple[Float[Array, "*B H W C"], Float[Array, "*B H W C"]]:
-    """[-1, 0, 1] in x and in y, zeros beyond the image, not halved."""
+    """[-1, 0, 1] in x and in y, not halved, with zeros beyond the image."""
     padded = _pad(image)
     dx = padded[..., 1:-1, 2:, :] - padded[..., 1:-1, :-2, :]
     dy = padded[..., 2:, 1:-1, :] - padded[..., :-2, 1:-1, :]

@@ -22,7 +22,7 @@ def sh_degree(step: Int[Array, ""] | int, config: Config) -> Int[Array, ""] | in
 
 
 def exponent_target(config: Config) -> float | Float[Array, ""]:
-    """Where the prior of `config.loss.exponent_prior` pulls B1: its start, or 1 if that is left to chance."""
+    """Where the prior of `config.loss.exponent_prior` pulls B1: to its initial value, or to 1 if none is set."""
     start = config.model.initial_exponents
     return start[0] if start else 1.0  # type: ignore[return-value]  # "auto" is resolved by then
 
@@ -39,17 +39,17 @@ def objective(
 ) -> tuple[Float[Array, ""], tuple[StepReport, Float[Array, "V N"]]]:
     """Eq. 15 plus the plane regularisers of 4DGS (arXiv 2310.08528) and what `LossConfig` adds, for one batch.
 
-    Gradients flow to `params` and to `probe`, zeros added to the projected centres. The loss is that of the views at
-    hand: with views spread over the devices of `axis`, its mean over them is the loss of all views.
+    Gradients flow to `params` and to `probe`. The loss is that of the views given: if views are spread over the devices
+    of `axis`, its mean over the devices is the loss of all views.
 
     Args:
         params: of the scene, in place of those that `state` holds.
-        probe: zeros, pixels.
+        probe: zeros, added to the projected centres, pixels.
         state: the scene, and which step this is.
         batch: V views.
         config: settings.
         moving: whether it is a step of the fine stage.
-        pair_capacity: size of the pair buffer for the views at hand.
+        pair_capacity: size of the pair buffer for the views given.
         axis: see `train_step`.
 
     Returns:
@@ -67,7 +67,7 @@ def objective(
         pair_capacity=pair_capacity,
         means2d_probe=probe,
         presence=presence(state, config),
-        chances=chances(state, config),
+        gate_noise=gate_noise(state, config),
     )
     cfg = config.loss
     start, steps = (config.coarse_steps, config.fine_steps) if moving else (0, config.coarse_steps)
@@ -96,14 +96,14 @@ def objective(
 
 
 def size_terms(scene: Scene, config: Config, moving: bool) -> losses.Terms:
-    """Weight and value of what keeps Gaussians few, small and still: means over those that are alive."""
+    """Weight and value of the terms that keep Gaussians few, small and static: means over those that are alive."""
     gaussians, alive, cfg = scene.params.gaussians, scene.alive, config.loss
 
     def mean(values: Float[Array, " N"]) -> Float[Array, ""]:
         return jnp.where(alive, values, 0).sum() / jnp.maximum(alive.sum(), 1).astype(values.dtype)
 
     def scale() -> Float[Array, ""]:
-        # Garbage in a dead row could overflow the exponential, and 0 * inf would be a gradient of NaN.
+        # Dead rows may hold any values: if exp overflowed on one, its gradient would be 0 * inf = NaN.
         scales = jnp.exp(jnp.where(alive[:, None], gaussians.log_scales, 0))
         return mean(scales.mean(-1)) / length_unit(scene.extent, config.model)
 
@@ -118,7 +118,7 @@ def size_terms(scene: Scene, config: Config, moving: bool) -> losses.Terms:
 
 
 def curve_terms(curves: ToneCurves | None, batch: Batch, cfg: LossConfig) -> losses.Terms:
-    """Weight and value of what gives the frames' tone curves their shape."""
+    """Weight and value of the priors on the shape of the frames' tone curves."""
     if curves is None:
         return {}
     own = tone_curves.of_frames(curves, batch.frames)
@@ -129,9 +129,9 @@ def curve_terms(curves: ToneCurves | None, batch: Batch, cfg: LossConfig) -> los
 
 
 def presence(state: TrainState, config: Config) -> Float[Array, " N"] | None:
-    """Factors on the opacities of this step: 0 for those that it leaves out (DropGaussian, arXiv 2504.09491).
+    """Factors on the opacities in this step: 0 for Gaussians that are dropped (DropGaussian, arXiv 2504.09491).
 
-    Their share grows evenly up to `config.drop` at the end of the run; the others make up for it.
+    Their share grows linearly up to `config.drop` at the end of the run; the factor of the others compensates for it.
     """
     if isinstance(config.drop, float) and config.drop == 0:
         return None
@@ -140,10 +140,11 @@ def presence(state: TrainState, config: Config) -> Float[Array, " N"] | None:
     return jnp.where(jax.random.bernoulli(key, share, state.scene.alive.shape), 0, 1 / (1 - share))
 
 
-def chances(state: TrainState, config: Config) -> Float[Array, " N"] | None:
-    """What makes the motion field act on Gaussians at random in this step, in proportion to the odds of their gates.
+def gate_noise(state: TrainState, config: Config) -> Float[Array, " N"] | None:
+    """Gumbel noise for the logits of the gates, which randomises the Gaussians that the motion field acts on.
 
-    Added to logits, Gumbel noise draws without replacement (arXiv 1903.06059): gates that have closed may open again.
+    The highest sums are draws without replacement, in proportion to the odds of the gates (arXiv 1903.06059): gates
+    that have closed may open again.
     """
     if not (config.model.motion_gate and config.model.moving_share < 1):
         return None
@@ -154,9 +155,9 @@ def chances(state: TrainState, config: Config) -> Float[Array, " N"] | None:
 def exposed(
     lowlight: Float[Array, "V H W 3"], exposures: Float[Array, "F 3"] | None, frames: Int[Array, " V"]
 ) -> Float[Array, "V H W 3"]:
-    """Low-light estimates as the camera exposed those training frames; both carry gradients.
+    """Low-light estimates with the exposure of their training frames; `lowlight` and `exposures` carry gradients.
 
-    Gains count relative to their geometric mean, which the scene's own brightness stands for.
+    Gains count relative to their geometric mean over the frames, which the scene's own brightness accounts for.
     """
     if exposures is None:
         return lowlight

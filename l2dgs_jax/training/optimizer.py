@@ -1,4 +1,4 @@
-"""Adam with a learning rate per parameter group, driven by jaxopt: the one file that knows of it."""
+"""Adam with a learning rate per parameter group, driven by jaxopt, which no other module imports."""
 
 import warnings
 from collections.abc import Callable
@@ -52,7 +52,7 @@ def learning_rate(schedule: Schedule, count: Int[Array, "*S"]) -> Float[Array, "
 
 @jax.jit
 def learning_rates(schedules: dict[str, Schedule], count: Int[Array, "*S"]) -> dict[str, Float[Array, "*S"]]:
-    """The rate of every group after so many steps."""
+    """The rate of every group after `count` steps."""
     return {name: learning_rate(schedule, count) for name, schedule in schedules.items()}
 
 
@@ -63,7 +63,7 @@ def adam(
     beta2: Float[Array, ""] | float,
     eps: Float[Array, ""] | float,
 ) -> Transformation:
-    """Adam (Kingma and Ba, arXiv 1412.6980) with bias correction and one schedule a group.
+    """Adam (Kingma and Ba, arXiv 1412.6980) with bias correction and one schedule per group.
 
     Args:
         groups: a group name for every leaf of the parameters.
@@ -80,7 +80,7 @@ def adam(
         raise ValueError(f"parameter groups {sorted(unknown)} have no learning rate; known: {sorted(rates)}")
 
     def init(params: PyTree) -> AdamState:
-        # Two trees of zeros, not one used twice: buffers that are donated may not be shared.
+        # Two trees of zeros, not one used twice: donated buffers must not be shared.
         return AdamState(
             step=jnp.zeros((), jnp.int32),
             mu=jax.tree.map(jnp.zeros_like, params),
@@ -116,10 +116,10 @@ def take_step(
         value_and_gradient: of the parameters: ((loss, auxiliary), gradient).
         transformation: turns a gradient into a step.
         params: before the step.
-        state: likewise.
+        state: of Adam, before the step.
 
     Returns:
-        Parameters and Adam's state after the step, the auxiliary, and the gradient's norm.
+        Parameters and Adam's state after the step, the auxiliary output, and the gradient's norm.
     """
     solver = OptaxSolver(value_and_gradient, transformation, value_and_grad=True, has_aux=True, jit=False)
     zero = jnp.zeros((), jnp.result_type(*jax.tree.leaves(params)))

@@ -1,7 +1,7 @@
-"""Gaussians to begin with on what moves, each with the path that its track tells.
+"""Initial Gaussians on moving things, each with a path fitted to a track of optical flow.
 
-Points from structure from motion are of what stands still. A motion field that starts from rest must then first find
-out which of them to carry where; tracks of optical flow say so before training begins.
+Points from structure from motion lie on static surfaces. A motion field that starts from rest would first have to find
+out which of them to move where; tracks of optical flow tell before training begins.
 """
 
 from typing import NamedTuple
@@ -18,28 +18,28 @@ from l2dgs_jax.training.depths import depths_around, depths_at, shared_depths
 from l2dgs_jax.training.flows import neighbour_flows
 from l2dgs_jax.training.tracks import SPACING, Tracks, find_tracks
 
-SHORTEST = 3  # frames that a track must be seen in
-MOVING = 0.4  # part of them in which it must be seen to move
-STRAY = 3.0  # pixels by which it must leave where any still point would be seen
-STIFFNESS = 1e-3  # weight of the squared bends of a path against squared distances from what was tracked
+MIN_LENGTH = 3  # frames that a track must be seen in
+MIN_MOVING_SHARE = 0.4  # share of these frames in which it must be seen to move
+MIN_DEVIATION = 3.0  # pixels that a track must at some time be away from where a static point would appear
+STIFFNESS = 1e-3  # weight of squared second differences of a path, relative to squared distances from the track
 
 
 def find_seeds(points: Float[np.ndarray, "P 3"], split: Split, most: int) -> Seeds:
-    """Seeds on what moves between the frames; none where flow cannot tell.
+    """Seeds on what moves between the frames; none where no flow can be trusted.
 
     Args:
         points: of the scene, world units.
         split: the frames.
-        most: how many seeds there may be; the tracks seen longest come first.
+        most: how many seeds there may be; the longest tracks come first.
     """
     cameras = _Cameras(*(np.asarray(x, np.float64) for x in split.cameras))
     height, width = split.images.shape[1:3]
     around = [depths_around(points, *camera[:2], height, width) for camera in zip(*cameras, strict=True)]
-    still = np.stack([depths.still for depths in around], axis=1)
-    tracks = find_tracks(split, neighbour_flows(split), still)
+    static = np.stack([depths.still for depths in around], axis=1)
+    tracks = find_tracks(split, neighbour_flows(split), static)
     knots = path_knots(len(cameras.time))
     weights = np.asarray(path_weights(jnp.asarray(cameras.time), knots))
-    chosen = _worthwhile(tracks, cameras, still, most)
+    chosen = _moving_tracks(tracks, cameras, static, most)
     if not chosen:
         shapes = ((0, 3), (0, 3), (0,), (0, knots, 3), (0, 2))
         return Seeds(*(np.zeros(shape, np.float32) for shape in shapes))
@@ -51,28 +51,34 @@ def find_seeds(points: Float[np.ndarray, "P 3"], split: Split, most: int) -> See
 
 
 class _Cameras(NamedTuple):
-    """A `Camera` of double precision in NumPy."""
+    """A `Camera` in NumPy arrays of double precision."""
 
     viewmat: Float[np.ndarray, "F 4 4"]
     K: Float[np.ndarray, "F 3 3"]
     time: Float[np.ndarray, " F"]
 
 
-def _worthwhile(tracks: Tracks, cameras: _Cameras, depths: Float32[np.ndarray, "C F h w"], most: int) -> list[Tracks]:
-    """The tracks, apart, that are long enough and lead away from where they would if their start stood still."""
+def _moving_tracks(
+    tracks: Tracks, cameras: _Cameras, depths: Float32[np.ndarray, "C F h w"], most: int
+) -> list[Tracks]:
+    """The tracks that are long enough and surely move, one by one.
+
+    They are seen to move in enough of their frames, and leave the place where their first point, taken as static, would
+    appear at any candidate depth.
+    """
     starts = np.flatnonzero(np.diff(tracks.numbers, prepend=-1))
     lengths = np.diff(starts, append=len(tracks.numbers))
     if not len(starts):
         return []
-    strays, viewmats, Ks = [], cameras.viewmat[tracks.frames], cameras.K[tracks.frames]
+    deviations, viewmats, Ks = [], cameras.viewmat[tracks.frames], cameras.K[tracks.frames]
     for depth in depths:
-        world = np.repeat(_lift(tracks, cameras, depths_at(tracks, depth))[starts], lengths, axis=0)
-        still, _ = project_points(world, viewmats, Ks)
-        strays.append(np.maximum.reduceat(np.linalg.norm(tracks.pixels - still, axis=-1), starts))
-    moves = np.add.reduceat(tracks.moves, starts) / lengths
-    strayed = np.min(strays, axis=0) > STRAY  # not where a depth is NaN
-    worth = np.flatnonzero((lengths >= SHORTEST) & (moves > MOVING) & strayed)
-    chosen = worth[np.argsort(-lengths[worth], kind="stable")[:most]]
+        world = np.repeat(_unprojected(tracks, cameras, depths_at(tracks, depth))[starts], lengths, axis=0)
+        static, _ = project_points(world, viewmats, Ks)
+        deviations.append(np.maximum.reduceat(np.linalg.norm(tracks.pixels - static, axis=-1), starts))
+    moving_share = np.add.reduceat(tracks.moves, starts) / lengths
+    deviates = np.min(deviations, axis=0) > MIN_DEVIATION  # not where a depth is NaN
+    kept = np.flatnonzero((lengths >= MIN_LENGTH) & (moving_share > MIN_MOVING_SHARE) & deviates)
+    chosen = kept[np.argsort(-lengths[kept], kind="stable")[:most]]
     return [Tracks(*(x[starts[i] : starts[i] + lengths[i]] for x in tracks)) for i in chosen]
 
 
@@ -83,31 +89,31 @@ def _seed(
     track: Tracks,
     depth: Float[np.ndarray, " O"],
 ) -> Seeds:
-    """What one track says, the middle of it being where the Gaussian is."""
+    """The seed of one track, whose middle observation becomes the canonical centre."""
     frames, instants = track.frames, np.unique(cameras.time)
     times = cameras.time[frames]
-    way, middle = _lift(track, cameras, depth), len(frames) // 2
-    # It is there half of the time to the frames in which it is seen no more.
+    positions, middle = _unprojected(track, cameras, depth), len(frames) // 2
+    # The lifetime extends halfway to the neighbouring instants, at which the track is not seen.
     first, last = np.searchsorted(instants, times[[0, -1]]).tolist()
     before, after = instants[max(first - 1, 0)], instants[min(last + 1, len(instants) - 1)]
     columns, rows = track.pixels.astype(int).T
     return Seeds(
-        points=way[middle],
+        points=positions[middle],
         colors=np.median(split.images[frames, rows, columns], axis=0),
         spacings=SPACING * depth[middle] / cameras.K[frames[middle], 0, 0],
-        paths=_fitted(weights[frames], way - way[middle]),
+        paths=_fitted_path(weights[frames], positions - positions[middle]),
         lifetimes=np.array([before + times[0], times[-1] + after]) / 2,
     )
 
 
-def _fitted(weights: Float[np.ndarray, "O K"], places: Float[np.ndarray, "O 3"]) -> Float[np.ndarray, "K 3"]:
-    """Control points of the straightest path, nearly through those places; beyond them it goes on as it went."""
-    bends = np.diff(np.eye(weights.shape[1]), 2, axis=0)
-    stiff = weights.T @ weights + STIFFNESS * bends.T @ bends
-    return np.linalg.solve(stiff, weights.T @ places)
+def _fitted_path(weights: Float[np.ndarray, "O K"], places: Float[np.ndarray, "O 3"]) -> Float[np.ndarray, "K 3"]:
+    """Control points of a smoothing spline through those places; beyond them it goes on straight."""
+    second_differences = np.diff(np.eye(weights.shape[1]), 2, axis=0)
+    normal = weights.T @ weights + STIFFNESS * second_differences.T @ second_differences
+    return np.linalg.solve(normal, weights.T @ places)
 
 
-def _lift(tracks: Tracks, cameras: _Cameras, depth: Float[np.ndarray, " O"]) -> Float[np.ndarray, "O 3"]:
+def _unprojected(tracks: Tracks, cameras: _Cameras, depth: Float[np.ndarray, " O"]) -> Float[np.ndarray, "O 3"]:
     """World points of observations at those depths."""
     viewmat, K = cameras.viewmat[tracks.frames], cameras.K[tracks.frames]
     homogeneous = np.concatenate([tracks.pixels, np.ones((len(depth), 1))], axis=-1)

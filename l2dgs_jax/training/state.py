@@ -20,8 +20,8 @@ class Batch(NamedTuple):
     Attributes:
         cameras: of the views.
         images: sRGB in [0, 1].
-        frames: which of the training frames they are.
-        valid: where there is something to learn; None for everywhere.
+        frames: indices of their training frames.
+        valid: pixels to learn from; None for all.
         depths: as in `Split`, 0 where unknown or not to be learned; None if the scene has none.
     """
 
@@ -48,9 +48,9 @@ class StepReport(NamedTuple):
         loss: Eq. 15 plus the plane regularisers.
         terms: each term, unweighted.
         psnr: of the low-light estimate against the input, dB, before the step.
-        pairs: (Gaussian, tile) pairs that the step needs; where views are spread over devices, on the fullest one.
-        overflow: whether they did not fit.
-        finite: whether loss and gradient are.
+        pairs: (Gaussian, tile) pairs that the step needs; if views are spread over devices, the most on any of them.
+        overflow: whether they did not fit into the pair buffer.
+        finite: whether loss and gradient are finite.
     """
 
     loss: Float[Array, "*S"]

@@ -27,17 +27,17 @@ def train_step(
     at: Int[Array, ""] | int | None = None,
     axis: str | None = None,
 ) -> tuple[TrainState, StepReport]:
-    """One Adam step on one batch; a step that cannot be trusted leaves the state as it was and says so.
+    """One Adam step on one batch; if pairs overflowed or a value is not finite, the report says so and the state stays.
 
     Args:
         state: before the step.
         batch: its views, or with `axis` this device's share of them, the same number on each.
         config: settings; the numbers of `overrides.TRACED` may be traced.
         moving: whether it is a step of the fine stage.
-        pair_capacity: size of the pair buffer for the views at hand.
+        pair_capacity: size of the pair buffer for the views given.
         at: the number of this step: a state that has not come that far, or is past it, is left as it was.
         axis: of `jax.shard_map`, over which the views of the batch are spread. Gradients and statistics are those of
-            all views, and every device returns the same.
+            all views, and the same on every device.
     """
     dtype = state.stats.seen.dtype
     batch = jax.tree.map(lambda x: x.astype(dtype) if jnp.issubdtype(x.dtype, jnp.floating) else x, batch)
@@ -47,11 +47,11 @@ def train_step(
         (loss, (report, radii)), (gradient, probe_gradient) = jax.value_and_grad(objective, (0, 1), has_aux=True)(
             params, probe, state, batch, config, moving, pair_capacity, axis
         )
-        loss, gradient, moved = devices.mean_over((loss, gradient, probe_gradient.sum(0)), axis)
-        return (loss, (report._replace(loss=loss), devices.max_over(radii.max(0), axis), moved)), gradient
+        loss, gradient, probe_sum = devices.mean_over((loss, gradient, probe_gradient.sum(0)), axis)
+        return (loss, (report._replace(loss=loss), devices.max_over(radii.max(0), axis), probe_sum)), gradient
 
     transformation = adam(state.scene.params, state.adam.schedules, config)
-    params, adam_state, (report, radii, moved), norm = optimizer.take_step(
+    params, adam_state, (report, radii, probe_gradient), norm = optimizer.take_step(
         value_and_grad, transformation, state.scene.params, state.adam
     )
 
@@ -70,7 +70,7 @@ def train_step(
     stepped = TrainState(
         scene=state.scene._replace(params=params),
         adam=adam_state,
-        stats=densification.accumulate(state.stats, moved, radii, width, height),
+        stats=densification.accumulate(state.stats, probe_gradient, radii, width, height),
         step=state.step + 1,
     )
     taken = report.finite & ~report.overflow
@@ -109,7 +109,7 @@ def begin_stage(scene: Scene, step: Int[Array, ""], config: Config, stage_steps:
 
 
 def densify(state: TrainState, config: Config, growths_left: Int[Array, ""] | int) -> tuple[TrainState, Int[Array, ""]]:
-    """Change the number of Gaussians; also how many rows that needs, to be called again with if there are fewer.
+    """Change the number of Gaussians; also the capacity to be called again with if rows ran out, otherwise 0.
 
     Args:
         state: after a step.
@@ -126,12 +126,12 @@ def densify(state: TrainState, config: Config, growths_left: Int[Array, ""] | in
     else:
         result = densification.densify(scene.params.gaussians, scene.alive, state.stats, scene.extent, key, cfg)
 
-    def forget(rows: Float[Array, "..."]) -> Float[Array, "..."]:
+    def reset(rows: Float[Array, "..."]) -> Float[Array, "..."]:
         return jnp.where(result.changed.reshape(-1, *[1] * (rows.ndim - 1)), 0, rows)
 
     grown = TrainState(
         scene=scene._replace(params=scene.params._replace(gaussians=result.gaussians), alive=result.alive),
-        adam=state.adam._replace(mu=map_gaussians(forget, state.adam.mu), nu=map_gaussians(forget, state.adam.nu)),
+        adam=state.adam._replace(mu=map_gaussians(reset, state.adam.mu), nu=map_gaussians(reset, state.adam.nu)),
         stats=jax.tree.map(jnp.zeros_like, state.stats),
         step=state.step,
     )
@@ -139,5 +139,5 @@ def densify(state: TrainState, config: Config, growths_left: Int[Array, ""] | in
 
 
 def tree_where(condition: Bool[Array, ""], new: T, old: T) -> T:
-    """One tree or the other."""
+    """`new` if the condition holds, else `old`."""
     return jax.tree.map(lambda new, old: jnp.where(condition, new, old), new, old)

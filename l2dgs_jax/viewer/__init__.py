@@ -1,4 +1,4 @@
-"""Runs in the browser: pictures are rendered here and streamed; a latest wish replaces those before it."""
+"""Viewing runs in the browser: pictures are rendered here and streamed; only the latest request of a client counts."""
 
 from l2dgs_jax.viewer.server import serve
 

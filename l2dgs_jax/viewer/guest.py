@@ -1,4 +1,4 @@
-"""One browser: its window, its controls, and the picture that it was shown last."""
+"""One browser, called a guest: its window, its controls, and the picture that it shows."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -19,14 +19,14 @@ from l2dgs_jax.viewer.renderers import Renderers
 from l2dgs_jax.viewer.stage import Stage
 from l2dgs_jax.visualize import display
 
-QUALITY = 90  # of JPEG
-FRUSTA = 40  # trained cameras that are shown, at most
-THUMBNAIL = 96  # pixels that their frames are wide
-FRUSTUM = 0.08  # size, in units of the stage
+JPEG_QUALITY = 90
+MAX_FRUSTA = 40  # training cameras that are shown
+THUMBNAIL_WIDTH = 96  # of their frames, pixels
+FRUSTUM_SIZE = 0.08  # units of the stage
 
 
 class View(NamedTuple):
-    """What a picture depends on, besides its size and its light."""
+    """What a picture depends on, except its size and the light."""
 
     step: int
     wxyz: tuple[float, ...]
@@ -37,7 +37,7 @@ class View(NamedTuple):
 
 
 class Shown(NamedTuple):
-    """What a browser shows."""
+    """The rendered view that a browser shows."""
 
     view: View
     size: Size
@@ -45,7 +45,7 @@ class Shown(NamedTuple):
 
 
 class Guest:
-    """A browser and what it is shown."""
+    """A browser and what it shows."""
 
     def __init__(
         self,
@@ -56,14 +56,14 @@ class Guest:
         ranges: display.Ranges,
         changed: Callable[[], None],
     ):
-        """Put up the controls and go to the first trained view.
+        """Create the controls and go to the first training view.
 
         Args:
-            client: of viser.
-            dataset: footage of what is shown.
-            stage: where that stands.
-            renderers: what draws it.
-            ranges: of the kinds of output that have colours only by their range.
+            client: a viser client.
+            dataset: the scene's frames and cameras.
+            stage: conversion between the scene's and the browser's cameras.
+            renderers: render the scene.
+            ranges: of the colour-mapped kinds of output.
             changed: called when the picture is out of date.
         """
         self._client, self._dataset, self._stage = client, dataset, stage
@@ -78,10 +78,10 @@ class Guest:
         self._go(first)
 
     def draw(self, sharpen: bool) -> bool:
-        """Bring the picture up to date, or make it sharper.
+        """Bring the picture up to date, or if `sharpen` and it is, render it at the next larger size.
 
         Returns:
-            Whether it could be sharper still.
+            Whether there is a still larger size.
         """
         view = self._view()
         sizes = self._renderers.compiled(ladder.ladder(view.window))
@@ -113,7 +113,7 @@ class Guest:
         cfg = self._renderers.run.config.model
         image = picture(shown.output, cfg, panel.kind, panel.light, panel.curtain, self._ranges)
         depth = hiding_depth(shown.output, self._stage.unit) if self._frusta else None
-        self._client.scene.set_background_image(image, format="jpeg", jpeg_quality=QUALITY, depth=depth)
+        self._client.scene.set_background_image(image, format="jpeg", jpeg_quality=JPEG_QUALITY, depth=depth)
         self._client.flush()
         width, height = shown.size
         panel.status.content = f"{width} x {height}, {1000 * self._renderers.seconds[shown.size]:.0f} ms"
@@ -123,7 +123,7 @@ class Guest:
         self._changed()
 
     def _go(self, index: int) -> None:
-        """Stand where a trained view was filmed, at its instant."""
+        """Go to the camera and the instant of a training view."""
         camera = self._client.camera
         trained = select_camera(self._dataset.train.cameras, index)
         pose = self._stage.pose(trained, self._window())
@@ -138,7 +138,7 @@ class Guest:
     def _show_frusta(self) -> None:
         if self._panel.frusta.value:
             count = len(self._dataset.train.names)
-            chosen = np.unique(np.linspace(0, count - 1, min(count, FRUSTA)).round().astype(int))
+            chosen = np.unique(np.linspace(0, count - 1, min(count, MAX_FRUSTA)).round().astype(int))
             self._frusta = [self._frustum(int(index)) for index in chosen]
         else:
             for frustum in self._frusta:
@@ -150,12 +150,12 @@ class Guest:
         split, (width, height) = self._dataset.train, self._stage.frame
         camera = select_camera(split.cameras, index)
         pose = self._stage.pose(camera, self._stage.frame)
-        thumbnail = (THUMBNAIL, round(height * THUMBNAIL / width))
+        thumbnail = (THUMBNAIL_WIDTH, round(height * THUMBNAIL_WIDTH / width))
         frustum = self._client.scene.add_camera_frustum(
             f"/filmed/{index}",
             fov=pose.field,
             aspect=width / height,
-            scale=FRUSTUM,
+            scale=FRUSTUM_SIZE,
             thickness=1.5,
             thickness_units="screen",
             color=(255, 200, 90),

@@ -1,25 +1,25 @@
-"""The sizes that pictures come in: few, because every one is a program to compile."""
+"""The sizes of pictures: few, because each one is a program to compile."""
 
 import math
 from collections.abc import Mapping, Sequence
 
 Size = tuple[int, int]  # width and height, pixels
 
-STEPS = (320 * 180, 640 * 360, 1280 * 720, 1920 * 1080)  # pixels
+PIXEL_COUNTS = (320 * 180, 640 * 360, 1280 * 720, 1920 * 1080)
 ASPECTS = (1 / 2, 3 / 4, 1.0, 4 / 3, 16 / 9, 12 / 5)  # width over height
-MOVING = 0.1  # seconds that a picture may take while something moves
-STILL = 1.5  # and when nothing does
+SECONDS_MOVING = 0.1  # that rendering a picture may take while the camera or time moves
+SECONDS_STILL = 1.5  # that it may take while nothing moves
 
 
 def ladder(window: Size) -> tuple[Size, ...]:
-    """Sizes of pictures for a window, smallest first, up to the first that has as many pixels.
+    """Sizes of pictures for a window, smallest first, up to the first with at least as many pixels as the window.
 
-    A picture fills the window, whose aspect is rarely one of `ASPECTS`: pixels need not be square.
+    A picture fills the window, whose aspect ratio is rarely one of `ASPECTS`, so its pixels need not be square.
     """
     width, height = window
     aspect = min(ASPECTS, key=lambda known: abs(math.log(known * height / width)))
-    smaller = sum(pixels < width * height for pixels in STEPS)
-    return tuple((_side(pixels * aspect), _side(pixels / aspect)) for pixels in STEPS[: smaller + 1])
+    smaller = sum(pixels < width * height for pixels in PIXEL_COUNTS)
+    return tuple((_side(pixels * aspect), _side(pixels / aspect)) for pixels in PIXEL_COUNTS[: smaller + 1])
 
 
 def _side(square: float) -> int:
@@ -27,8 +27,9 @@ def _side(square: float) -> int:
 
 
 def while_moving(sizes: Sequence[Size], seconds: Mapping[Size, float]) -> Size:
-    """The largest size that takes no longer than `MOVING`, or else the smallest."""
-    return max((size for size in sizes if seconds[size] <= MOVING), key=math.prod, default=min(sizes, key=math.prod))
+    """The largest size that takes no longer than `SECONDS_MOVING`, or else the smallest."""
+    fast = (size for size in sizes if seconds[size] <= SECONDS_MOVING)
+    return max(fast, key=math.prod, default=min(sizes, key=math.prod))
 
 
 def sharper(sizes: Sequence[Size], size: Size) -> Size | None:

@@ -1,4 +1,4 @@
-"""A training in the browser while it goes on, at little cost to it."""
+"""Viewing a scene in the browser while it trains, at little cost to the training."""
 
 import contextlib
 import time
@@ -12,25 +12,25 @@ from l2dgs_jax.runtime import devices
 from l2dgs_jax.training import Progress
 from l2dgs_jax.viewer.server import Server, serve
 
-INTERVAL = 2.0  # seconds from one state that is shown to the next, at least
-SHARE = 0.05  # of the time that drawing takes
+LEAST_INTERVAL = 2.0  # seconds between states that are shown
+RENDERING_SHARE = 0.05  # of the time
 
 
 @contextlib.contextmanager
 def live(
     dataset: Dataset, config: Config, host: str, port: int, told: Callable[[int], None]
 ) -> Iterator[Callable[[Progress], None]]:
-    """What shows the states of a training while the block is entered.
+    """Show the states of a training in the browser for the length of the block.
 
     Args:
         dataset: its scene.
-        config: its settings, what they left to the data filled in.
+        config: its settings, resolved by `training.resolve`.
         host: address to listen at, see `server.check`.
-        port: to listen at, or the next that is free.
+        port: port to listen at, or the next free one.
         told: called with the port once there is something to see.
 
     Yields:
-        What to call after every step.
+        A function to call after every step.
     """
     with contextlib.ExitStack() as stack:
         server: Server | None = None
@@ -44,8 +44,8 @@ def live(
             if server:
                 server.show(state)
             else:
-                server = stack.enter_context(serve(Run(config, dataset, state), host, port, SHARE))
+                server = stack.enter_context(serve(Run(config, dataset, state), host, port, RENDERING_SHARE))
                 told(server.port)
-            due = time.monotonic() + INTERVAL
+            due = time.monotonic() + LEAST_INTERVAL
 
         yield on_step

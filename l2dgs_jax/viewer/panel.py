@@ -8,7 +8,7 @@ from l2dgs_jax.runs.pictures import Output
 from l2dgs_jax.viewer.playhead import Playhead
 from l2dgs_jax.viewer.relighting import Light
 
-NAMES: dict[str, Output] = {
+OUTPUT_NAMES: dict[str, Output] = {
     "well-lit": "welllit",
     "low-light": "lowlight",
     "L, illumination": "illumination",
@@ -21,23 +21,23 @@ NAMES: dict[str, Output] = {
 
 
 class Panel:
-    """Controls and what they say.
+    """The controls and their values.
 
     Attributes:
-        frusta: the switch that shows the trained cameras.
-        home: the button that leads back to the first of them.
+        frusta: the checkbox that shows the training cameras.
+        home: the button that returns to the first of them.
         status: a line of text.
     """
 
     def __init__(self, gui: Any, changed: Callable[[], None]):
-        """Put the controls up.
+        """Create the controls.
 
         Args:
-            gui: of a viser client.
-            changed: called when a control has been moved, unless by this class.
+            gui: that of a viser client.
+            changed: called when the user has changed a control.
         """
         self._changed, self._playhead = changed, Playhead.now(0.0)
-        self._kind = gui.add_dropdown("Show", tuple(NAMES))
+        self._kind = gui.add_dropdown("Show", tuple(OUTPUT_NAMES))
         self._curtain = gui.add_slider("Curtain", 0.0, 1.0, 0.005, 0.0, hint="Left of it: as dark as it was filmed")
         with gui.add_folder("Time"):
             self._instant = gui.add_slider("Instant", 0.0, 1.0, 0.001, 0.0, hint="0 is the first frame, 1 the last")
@@ -67,12 +67,12 @@ class Panel:
 
     @property
     def kind(self) -> Output:
-        """What to show."""
-        return NAMES[self._kind.value]
+        """The kind of output to show."""
+        return OUTPUT_NAMES[self._kind.value]
 
     @property
     def curtain(self) -> float:
-        """How much of the width it covers."""
+        """The share of the width that the curtain covers."""
         return self._curtain.value
 
     @property
@@ -86,7 +86,7 @@ class Panel:
         return self._playing.value
 
     def instant(self) -> float:
-        """The instant to show now, to which the slider follows."""
+        """The instant to show now; moves the slider to it."""
         if self.playing:
             instant, goes_on = self._playhead.at(time.monotonic(), self._duration.value, self._loop.value)
             self._instant.value = round(instant, 3)
@@ -99,7 +99,7 @@ class Panel:
         self._instant.value = instant
 
     def _play_from_here(self, event: Any) -> None:
-        if event.client is not None:  # by hand
+        if event.client is not None:  # changed by the user, not by this class
             at_end = event.target is self._playing and self._instant.value == 1.0
             self._playhead = Playhead.now(0.0 if at_end else self._instant.value)
             self._changed()

@@ -1,15 +1,15 @@
-"""Time as it runs while a scene is played."""
+"""The instant to show while a scene is played."""
 
 import time
 from typing import NamedTuple
 
 
 class Playhead(NamedTuple):
-    """Where playing began.
+    """The instant at which playing began, and when.
 
     Attributes:
         instant: of the scene, in [0, 1].
-        begun: when that was shown, seconds of the clock.
+        begun: time at which playing began there, seconds of `time.monotonic`.
     """
 
     instant: float
@@ -17,16 +17,16 @@ class Playhead(NamedTuple):
 
     @classmethod
     def now(cls, instant: float) -> "Playhead":
-        """Playing from `instant` on."""
+        """A playhead that starts at `instant` now."""
         return cls(instant, time.monotonic())
 
     def at(self, clock: float, duration: float, loop: bool) -> tuple[float, bool]:
         """The instant to show and whether playing goes on.
 
         Args:
-            clock: seconds of the clock.
+            clock: present time, seconds of `time.monotonic`.
             duration: seconds from the first instant of the scene to the last.
-            loop: whether the first follows on the last.
+            loop: whether to start again after the last instant.
         """
         instant = self.instant + (clock - self.begun) / duration
         if loop:

@@ -1,4 +1,4 @@
-"""A decomposed view put together again in another light: what the low-light image is made by (Eq. 9), with a slider."""
+"""Relighting a decomposed view: the formula of the low-light image (Eq. 9) with adjustable exponents."""
 
 from functools import partial
 from typing import Any, NamedTuple
@@ -14,16 +14,16 @@ from l2dgs_jax.model.decomposition import as_light, full_light, power, product
 from l2dgs_jax.types import Decomposition
 
 LUMINANCE: Float[np.ndarray, "3"] = np.array([0.2126, 0.7152, 0.0722])  # of linear red, green and blue (Rec. 709)
-WARMEST = 0.8  # stops between the gains of red and green, and of green and blue, at full warmth
+FULL_WARMTH = 0.8  # stops between the gains of red and green, and of green and blue, at warmth 1
 
 
 class Light(NamedTuple):
-    """How a view is lit. As it stands: the well-lit image.
+    """How a view is lit; the default is the well-lit image.
 
     Attributes:
-        brightness: 0 is as dark as filmed, 1 well-lit, and more is brighter still: the exponents of R and L are B1 and
+        brightness: 0 is as dark as filmed, 1 well-lit, and more is still brighter: the exponents of R and L are B1 and
             B2 to the power of 1 - brightness.
-        shading: on the exponent of L; 0 is light that is the same everywhere.
+        shading: factor on the exponent of L; 0 gives the same light everywhere.
         gain: on linear light, stops.
         warmth: from -1, blue, to 1, orange.
         tint: from -1, green, to 1, magenta.
@@ -38,12 +38,12 @@ class Light(NamedTuple):
 
 @partial(jax.jit, static_argnames="cfg")
 def relit(images: Decomposition, light: Light, cfg: ModelConfig) -> Float[Array, "H W 3"]:
-    """(L^(shading B2^d) R^(B1^d)) with d = 1 - brightness, its white balanced and multiplied in linear light.
+    """L^(shading B2^d) R^(B1^d) with d = 1 - brightness, then white balance and gain in linear light.
 
     Args:
-        images: of a view.
+        images: decomposition of a view.
         light: how it is lit.
-        cfg: shape of the scene: what is raised to powers, and which L is full light.
+        cfg: settings of the model: what is raised to powers, and which L is full light.
 
     Returns:
         sRGB values in [0, 1].
@@ -57,6 +57,6 @@ def relit(images: Decomposition, light: Light, cfg: ModelConfig) -> Float[Array,
 
 
 def white_balance(warmth: Any, tint: Any) -> Float[Array, "3"]:
-    """Gains of linear red, green and blue that leave the luminance of grey as it is; see `Light`."""
-    gains = 2.0 ** (WARMEST * jnp.stack([warmth + tint / 2, -tint / 2, -warmth + tint / 2]))
+    """Gains of linear red, green and blue that preserve the luminance of grey; for the arguments see `Light`."""
+    gains = 2.0 ** (FULL_WARMTH * jnp.stack([warmth + tint / 2, -tint / 2, -warmth + tint / 2]))
     return gains / (LUMINANCE * gains).sum()

@@ -1,4 +1,4 @@
-"""A run in the browser."""
+"""The server that shows a run to browsers."""
 
 import contextlib
 import io
@@ -25,16 +25,16 @@ from l2dgs_jax.viewer.turns import Turns
 from l2dgs_jax.visualize import films
 
 USUAL_WINDOW = 1280, 720  # pixels
-LONGEST_REST = 2.0  # seconds for which others have the processor to themselves after a picture
+LONGEST_REST = 2.0  # seconds without rendering after a picture, while a training uses the processor
 
 
 class Server(NamedTuple):
-    """What shows a run.
+    """A running server.
 
     Attributes:
         port: where it listens.
-        watched: whether any browser looks.
-        show: shows the same run at another state from now on.
+        watched: returns whether any browser is connected.
+        show: shows another state of the run from now on.
     """
 
     port: int
@@ -43,15 +43,15 @@ class Server(NamedTuple):
 
 
 def check(host: str, port: int, prefix: str = "") -> None:
-    """Complain of what makes no address, or of what is missing.
+    """Check that a server can be started.
 
     Args:
         host: address to listen at.
-        port: to listen at.
-        prefix: of the options that these come from.
+        port: port to listen at.
+        prefix: of the names of the options for these, for messages.
 
     Raises:
-        UserError: viser is not installed, the port is none, or there is no listening at that address.
+        UserError: viser is not installed, the port is invalid, or listening at that address is not possible.
     """
     extra("viser", "view", "viewing")
     if not 1 <= port <= 65535:
@@ -65,16 +65,16 @@ def check(host: str, port: int, prefix: str = "") -> None:
 
 @contextlib.contextmanager
 def serve(run: Run, host: str, port: int, share: float = 1.0) -> Iterator[Server]:
-    """Show a run to browsers while the block is entered.
+    """Show a run to browsers for the length of the block.
 
-    Every browser has its own camera, instant and light. One thread draws for all of them.
+    Every browser has its own camera, instant and light. One thread renders for all of them.
 
     Args:
-        run: what to show.
+        run: the run to show.
         host: address to listen at, see `check`.
-        port: to listen at, or the next that is free.
-        share: of the time that drawing may take, as long as a picture does not take more than that of `LONGEST_REST`.
-            Below 1, pictures remain as small and coarse as those that move.
+        port: port to listen at, or the next free one.
+        share: share of the time that rendering may take; rests between pictures are at most `LONGEST_REST`, so that it
+            is exceeded if a picture takes long. Below 1, no larger sizes are compiled and pictures remain coarse.
 
     Yields:
         The server.
@@ -92,12 +92,12 @@ def serve(run: Run, host: str, port: int, share: float = 1.0) -> Iterator[Server
     ranges = films.sampled_ranges(run, reframe(trained, frame, smallest), ("b1", "b2", "depth"), smallest)
     stage = Stage.of(trained, np.asarray(run.dataset.points), frame)
 
-    with contextlib.redirect_stdout(io.StringIO()):  # it introduces itself
+    with contextlib.redirect_stdout(io.StringIO()):  # viser prints a banner
         server = extra("viser", "view", "viewing").ViserServer(host, port, label="l2dgs", verbose=False)
     server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
     server.scene.set_up_direction(mean_up(np.asarray(trained.viewmat)))
 
-    # Coroutines come and go in order; functions would run in threads.
+    # As coroutines, these run in order; viser would run plain functions in threads.
     @server.on_client_connect
     async def _(client: Any) -> None:
         number = client.client_id
@@ -120,7 +120,7 @@ def serve(run: Run, host: str, port: int, share: float = 1.0) -> Iterator[Server
             try:
                 if guest and guest.draw(turn.sharpen):
                     turns.rest(turn.guest)
-            except Exception:  # a picture that fails is no reason to stop showing others
+            except Exception:  # a failed picture should not end the server
                 traceback.print_exc()
             if share < 1:
                 over.wait(min((time.monotonic() - begun) * (1 / share - 1), LONGEST_REST))

@@ -1,4 +1,4 @@
-"""Where a scene stands in the browser, and what a browser's camera is to the renderer."""
+"""Conversion between the cameras of a scene and those of a browser."""
 
 import math
 from typing import NamedTuple
@@ -13,12 +13,12 @@ from l2dgs_jax.viewer.ladder import Size
 
 
 class Pose(NamedTuple):
-    """A camera as browsers have it, in units of the stage.
+    """A browser's camera, in units of the stage.
 
     Attributes:
         position: its centre.
-        look_at: the point that it turns around.
-        up: which way is up in its picture.
+        look_at: the point that it orbits.
+        up: direction that is up in its picture.
         field: vertical field of view, radians.
     """
 
@@ -29,10 +29,10 @@ class Pose(NamedTuple):
 
 
 class Stage(NamedTuple):
-    """The world in another unit, so that scenes of every size are a handy distance away.
+    """The scene's world in another unit of length, so that scenes of all sizes are at a similar distance.
 
     Attributes:
-        unit: of the stage, world units.
+        unit: unit of length of the stage, world units.
         frame: width and height of the scene's own images, pixels.
     """
 
@@ -41,7 +41,7 @@ class Stage(NamedTuple):
 
     @classmethod
     def of(cls, cameras: Camera, points: Float[np.ndarray, "P 3"], frame: Size) -> "Stage":
-        """The stage on which the points lie at a median distance of 1 from the cameras."""
+        """The stage on which the points have a median depth of 1 in the cameras."""
         try:
             unit = median_depth(cameras, points)
         except ValueError:
@@ -49,7 +49,7 @@ class Stage(NamedTuple):
         return cls(unit, frame)
 
     def pose(self, camera: Camera, window: Size) -> Pose:
-        """Where a browser stands to see what a camera of the scene sees; its window is filled and the rest cut off."""
+        """The browser's camera that sees what a camera of the scene sees, cropped to fill the window."""
         viewmat = np.asarray(camera.viewmat, np.float64)
         position = camera_centres(viewmat) / self.unit
         field = self.field(camera)
@@ -74,11 +74,12 @@ class Stage(NamedTuple):
         """The camera of a picture that fills a browser's window.
 
         Args:
-            wxyz: rotation from its axes, which are OpenCV's, to those of the world.
+            wxyz: rotation from the camera's axes, which are OpenCV's, to those of the world.
             position: its centre, units of the stage.
             field: vertical field of view, radians.
-            window: width and height of what the picture fills.
-            size: width and height of the picture, pixels; of another shape than the window, its pixels are not square.
+            window: width and height of the window.
+            size: width and height of the picture, pixels; its pixels are not square if it has another aspect ratio than
+                the window.
             time: instant in [0, 1].
         """
         viewmat, K = np.eye(4, dtype=np.float32), np.eye(3, dtype=np.float32)

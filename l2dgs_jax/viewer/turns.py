@@ -1,20 +1,20 @@
-"""Whose picture is drawn next. What it shows is read when its turn comes: what was wanted before is never drawn."""
+"""Which guest's picture is drawn next. Its camera is read only when its turn comes, so outdated views are not drawn."""
 
 import threading
 import time
 from collections.abc import Callable
 from typing import NamedTuple
 
-INTERVAL = 1 / 30  # seconds from one picture of a guest to the next, at least
-REST = 0.25  # seconds without a change after which a picture is sharpened
+LEAST_INTERVAL = 1 / 30  # seconds between two pictures of a guest
+SHARPEN_AFTER = 0.25  # seconds without a change
 
 
 class Turn(NamedTuple):
-    """A guest's turn.
+    """A guest's turn to get a picture.
 
     Attributes:
-        guest: whose.
-        sharpen: whether the picture is up to date and only to become sharper.
+        guest: number of the guest.
+        sharpen: whether the picture is up to date and should only become sharper.
     """
 
     guest: int
@@ -22,43 +22,44 @@ class Turn(NamedTuple):
 
 
 class Turns:
-    """The turns of guests, for a thread that draws.
+    """The order in which a drawing thread serves guests.
 
-    First come those who wait for a picture, then those who could have a sharper one; among them whoever waits longest.
+    Guests that wait for a new picture come before those whose picture can be sharpened; within each group, the one that
+    has waited longest comes first.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic):
         self._clock = clock
         self._news = threading.Condition()
-        self._due: dict[int, tuple[bool, float]] = {}  # by guest: whether only to sharpen, and from when on
+        self._due: dict[int, tuple[bool, float]] = {}  # by guest: whether only to sharpen, and not before when
         self._changed: dict[int, float] = {}
         self._drawn: dict[int, float] = {}
         self._closed = False
 
     def ask(self, guest: int) -> None:
-        """What the guest wants to see has changed."""
+        """Request a new picture: what the guest wants to see has changed."""
         with self._news:
             now = self._clock()
             self._changed[guest] = now
             if self._due.get(guest, (True, 0))[0]:
-                self._due[guest] = False, max(now, self._drawn.get(guest, -1) + INTERVAL)
+                self._due[guest] = False, max(now, self._drawn.get(guest, -1) + LEAST_INTERVAL)
             self._news.notify()
 
     def rest(self, guest: int) -> None:
-        """The guest's picture can become sharper, once nothing has changed for a while."""
+        """Request that the guest's picture is sharpened once nothing has changed for a while."""
         with self._news:
             if guest in self._changed:
-                self._due.setdefault(guest, (True, self._changed[guest] + REST))
+                self._due.setdefault(guest, (True, self._changed[guest] + SHARPEN_AFTER))
             self._news.notify()
 
     def leave(self, guest: int) -> None:
-        """The guest has gone."""
+        """Forget a guest that has disconnected."""
         with self._news:
             for facts in (self._due, self._changed, self._drawn):
                 facts.pop(guest, None)
 
     def close(self) -> None:
-        """There are no more turns."""
+        """End all turns: `take` then returns None."""
         with self._news:
             self._closed = True
             self._news.notify_all()
@@ -74,7 +75,7 @@ class Turns:
         return None
 
     def next(self) -> tuple[Turn | None, float | None]:
-        """The turn that is due, or else the seconds until one will be, if anybody waits."""
+        """The turn that is due, if any, or else the seconds until the next one; (None, None) if nobody waits."""
         if not self._due:
             return None, None
         now = self._clock()

@@ -1,4 +1,4 @@
-"""A few instants of a run at a glance."""
+"""Contact sheets: a few instants of a run at a glance."""
 
 import jax
 import numpy as np
@@ -23,10 +23,10 @@ RENDERED: dict[str, Output] = {
 
 
 def contact_sheet(run: Run, rows: int = 4) -> UInt8[np.ndarray, "H W 3"]:
-    """Pictures of a few instants, one row each, in the columns of `COLUMNS`; the truth only where there is one.
+    """Pictures of a few instants, one per row, in the columns of `COLUMNS`; "truth" only if the scene has it.
 
-    L and R are shown as they are. B1, B2 and depth are coloured (viridis) from their 2nd to their 98th percentile over
-    all rows, the range that their heading states.
+    L and R are shown as they are. B1, B2 and depth are colour-mapped (viridis) from their 2nd to their 98th percentile
+    over all rows; their headings state this range.
 
     Args:
         run: the run.

@@ -1,4 +1,4 @@
-"""How what is rendered is shown: colours as they are, parts in grey, exponents and depth in viridis."""
+"""How rendered outputs are shown: images in colour, L and alpha in grey, exponents and depth with a colour map."""
 
 from collections.abc import Sequence
 
@@ -10,15 +10,15 @@ from l2dgs_jax.runs.pictures import Output, values
 from l2dgs_jax.types import RenderOutput
 from l2dgs_jax.visualize.sheet import viridis
 
-COLOURED: tuple[Output, ...] = ("b1", "b2", "depth")
-LEAST_RANGE = 0.01  # of a value; colours for less would show how an exponent that is one number is rounded
+COLOR_MAPPED: tuple[Output, ...] = ("b1", "b2", "depth")
+LEAST_RANGE = 0.01  # relative; with a smaller range, a constant exponent would show rounding errors
 
 Ranges = dict[Output, tuple[float, float]]
 
 
 def ranges(outputs: Sequence[RenderOutput]) -> Ranges:
-    """From the 2nd to the 98th percentile of some views, for each kind that has colours only by its range."""
-    spans = {kind: np.percentile([values(output, kind) for output in outputs], (2, 98)) for kind in COLOURED}
+    """Ranges of the colour maps: from the 2nd to the 98th percentile over some views, for each colour-mapped kind."""
+    spans = {kind: np.percentile([values(output, kind) for output in outputs], (2, 98)) for kind in COLOR_MAPPED}
     return {kind: (float(low), float(max(high, (1 + LEAST_RANGE) * low))) for kind, (low, high) in spans.items()}
 
 

@@ -11,22 +11,22 @@ from l2dgs_jax.cameras import select_camera
 from l2dgs_jax.cameras.paths import space_time_path
 from l2dgs_jax.runs.pictures import Output
 from l2dgs_jax.runs.run import Run
-from l2dgs_jax.runs.shots import RATE
+from l2dgs_jax.runs.shots import DEFAULT_FPS
 from l2dgs_jax.runs.views import views
 from l2dgs_jax.types import Camera
 from l2dgs_jax.visualize import display
 from l2dgs_jax.visualize.video import open_video, video_path
 
-SECONDS = 4
-SAMPLES = 8  # views that decide the range of colours
+RUN_VIDEO_SECONDS = 4  # length of the video that `train` writes
+RANGE_VIEWS = 8  # views from which the ranges of colour maps are taken
 
 
 def write_run_video(run: Run, stem: Path, *, quiet: bool = False) -> Path:
-    """A short flight through space and time: the estimate of the dark input on the left, well-lit on the right.
+    """Write a short flight through space and time: the estimate of the dark input on the left, well-lit on the right.
 
     Args:
         run: the run.
-        stem: the file without its ending.
+        stem: the file without its suffix.
         quiet: show no progress.
 
     Returns:
@@ -35,7 +35,7 @@ def write_run_video(run: Run, stem: Path, *, quiet: bool = False) -> Path:
     Raises:
         UserError: the file cannot be written.
     """
-    cameras = space_time_path(run.dataset.train.cameras, SECONDS * RATE)
+    cameras = space_time_path(run.dataset.train.cameras, RUN_VIDEO_SECONDS * DEFAULT_FPS)
     return write_videos(run, cameras, {stem: ("lowlight", "welllit")}, quiet=quiet)[0]
 
 
@@ -45,17 +45,17 @@ def write_videos(
     shown: Mapping[Path, Sequence[Output]],
     *,
     size: tuple[int, int] | None = None,
-    fps: float | int = RATE,
+    fps: float | int = DEFAULT_FPS,
     quiet: bool = False,
 ) -> list[Path]:
     """Write videos of the same cameras, whole or not at all.
 
     Args:
         run: the run.
-        cameras: a batch, a frame each.
-        shown: by the file without its ending, what is side by side in it.
+        cameras: a batch with one camera per frame.
+        shown: for each file without its suffix, the outputs that it shows side by side.
         size: width and height of each of these pictures, pixels; the data set's if not given.
-        fps: frames a second.
+        fps: frames per second.
         quiet: show no progress.
 
     Returns:
@@ -79,9 +79,9 @@ def write_videos(
 def sampled_ranges(
     run: Run, cameras: Camera, kinds: Sequence[Output], size: tuple[int, int] | None = None
 ) -> display.Ranges:
-    """Ranges of colours from a few of the cameras, before all of them are rendered; none if no kind needs one."""
-    if not set(kinds) & set(display.COLOURED):
+    """Ranges of colour maps, from a few of the cameras; empty if no kind of output needs one."""
+    if not set(kinds) & set(display.COLOR_MAPPED):
         return {}
     renderer = run.renderer(*size or (None, None))
-    chosen = np.unique(np.linspace(0, len(cameras.time) - 1, SAMPLES).round().astype(int))
+    chosen = np.unique(np.linspace(0, len(cameras.time) - 1, RANGE_VIEWS).round().astype(int))
     return display.ranges([jax.device_get(renderer(select_camera(cameras, int(i)))) for i in chosen])

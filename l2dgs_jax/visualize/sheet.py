@@ -1,4 +1,4 @@
-"""Pictures in rows and columns under headings."""
+"""Sheets: pictures in rows and columns under headings."""
 
 from collections.abc import Sequence
 
@@ -8,17 +8,17 @@ from jaxtyping import Float, UInt8
 
 from l2dgs_jax.data.images import to_bytes
 
-CELL_WIDTHS = (160, 400)  # pixels that a picture in the contact sheet is at least and at most wide
+CELL_WIDTHS = (160, 400)  # least and largest width of a picture on the sheet, pixels
 
 
-STRIP = 22  # height of a line of text, pixels
+STRIP_HEIGHT = 22  # of a line of text, pixels
 GAP = 4  # pixels between pictures
 
 
 def sheet(
     headings: Sequence[str], rows: Sequence[tuple[str, Sequence[UInt8[np.ndarray, "h w 3"]]]]
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """Pictures of one size in rows under headings, each row below its caption."""
+    """Pictures of the same size in rows under common headings; each row has its caption above it."""
     lines = []
     for caption, pictures in rows:
         cells = np.hstack([np.pad(cell(picture), ((0, GAP), (0, GAP), (0, 0))) for picture in pictures])
@@ -28,13 +28,13 @@ def sheet(
 
 
 def viridis(values: Float[np.ndarray, "H W"], low: float, high: float) -> UInt8[np.ndarray, "H W 3"]:
-    """Colours from dark violet at `low` to yellow at `high`; black and white print keeps the order."""
+    """The colour map viridis, from dark violet at `low` to yellow at `high`; its lightness increases throughout."""
     scaled = (values - low) / (high - low) if high > low else np.zeros_like(values)
     return np.ascontiguousarray(cv2.applyColorMap(to_bytes(scaled), cv2.COLORMAP_VIRIDIS)[..., ::-1])
 
 
 def cell(picture: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "h w 3"]:
-    """The picture at a legible width: enlarged by whole pixels, or reduced."""
+    """The picture at a width within `CELL_WIDTHS`: enlarged by an integer factor, or reduced."""
     narrow, wide = CELL_WIDTHS
     height, width = picture.shape[:2]
     if width > wide:
@@ -45,5 +45,6 @@ def cell(picture: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "h w 3"]:
 
 def text_strip(text: str, width: int) -> UInt8[np.ndarray, "h w 3"]:
     """One line of text, white on black; what does not fit is cut off."""
-    strip = np.zeros((STRIP, width, 3), np.uint8)
-    return cv2.putText(strip, text, (4, STRIP - 7), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (255, 255, 255), 1, cv2.LINE_AA)
+    strip = np.zeros((STRIP_HEIGHT, width, 3), np.uint8)
+    place = (4, STRIP_HEIGHT - 7)
+    return cv2.putText(strip, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.42, (255, 255, 255), 1, cv2.LINE_AA)

@@ -1,4 +1,4 @@
-"""Videos that browsers play: H.264 in .mp4 by PyAV where it is installed, else VP8 in .webm by OpenCV."""
+"""Videos that browsers play: H.264 in .mp4 with PyAV if it is installed, or else VP8 in .webm with OpenCV."""
 
 import contextlib
 import os
@@ -20,17 +20,17 @@ _BT709, _SRGB, _BT601, _LIMITED = 1, 13, 6, 1  # numbers of ITU-T H.273: primari
 
 @contextlib.contextmanager
 def open_video(stem: Path, size: tuple[int, int], fps: float | int) -> Iterator[Add]:
-    """Write a video whole or not at all: what is yielded adds a frame, RGB.
+    """Write a video whole or not at all; yields a function that adds an RGB frame.
 
-    Codecs want even sizes: the last column or row of an odd one is doubled.
+    Codecs need even sizes: if a size is odd, the last column or row is repeated.
 
     Args:
-        stem: the file without its ending; `video_path` has it with the ending.
+        stem: the file without its suffix; `video_path` returns it with the suffix.
         size: width and height of the frames, pixels.
-        fps: frames a second.
+        fps: frames per second.
 
     Raises:
-        UserError: the file cannot be written, or not by this codec.
+        UserError: the file cannot be written, or OpenCV lacks the codec.
     """
     path, (width, height) = video_path(stem), size
     even = width + width % 2, height + height % 2
@@ -45,7 +45,7 @@ def video_path(stem: Path) -> Path:
 
 
 def _pyav() -> Any:
-    """PyAV, if it is installed and has an encoder."""
+    """PyAV, if it is installed and has the encoder libx264."""
     try:
         import av
 
@@ -58,7 +58,7 @@ def _pyav() -> Any:
 @contextlib.contextmanager
 def _h264(path: Path, size: tuple[int, int], fps: float | int) -> Iterator[Add]:
     av = _pyav()
-    # The index goes to the front, so that a browser starts before it has the whole file.
+    # "+faststart" puts the index at the front, so that a browser can start before it has the whole file.
     with av.open(str(path), "w", format="mp4", options={"movflags": "+faststart"}) as file:
         stream = file.add_stream("libx264", Fraction(fps).limit_denominator(1001), options={"crf": "18"})
         stream.width, stream.height = size
@@ -96,12 +96,12 @@ def _vp8(path: Path, size: tuple[int, int], fps: float | int) -> Iterator[Add]:
     complete = sum(iter(written.grab, False)) == added
     written.release()
     if not complete:
-        raise OSError(0, "frames are missing, the disk may be full")  # of which OpenCV says nothing
+        raise OSError(0, "frames are missing, the disk may be full")  # OpenCV itself reports nothing
 
 
 @contextlib.contextmanager
 def _silence() -> Iterator[None]:
-    """OpenCV complains on standard error, not through Python, that WebM knows codecs by name and not by tag."""
+    """Suppress standard error, where OpenCV's C code warns that WebM has names instead of tags for codecs."""
     kept = os.dup(2)
     try:
         with open(os.devnull, "w") as nothing:

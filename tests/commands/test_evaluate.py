@@ -19,7 +19,7 @@ from l2dgs_jax.data import load_dataset
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.evaluate import evaluate, main, table
 from l2dgs_jax.metrics.flip import flip_map
-from l2dgs_jax.metrics.lpips import SMALLEST
+from l2dgs_jax.metrics.lpips import SMALLEST_SIDE
 from l2dgs_jax.runs.lpips_weights import load_lpips
 from l2dgs_jax.runs.views import views
 from l2dgs_jax.runtime import command_line
@@ -160,7 +160,7 @@ def test_scores_beyond_these_are_there_or_null(result, rendered):
 
 def test_lpips_in_the_papers_convention_is_shared_out_by_area(run, monkeypatch, tmp_path):
     monkeypatch.setitem(metrics.NETWORKS, "alex", networks.TINY)
-    monkeypatch.setitem(SMALLEST, "alex", 1)
+    monkeypatch.setitem(SMALLEST_SIDE, "alex", 1)
     np.savez(tmp_path / "tiny.npz", **networks.state_dict("alex"))
     weights = load_lpips("alex", [tmp_path / "tiny.npz"])
     found = evaluate(run, lpips={"alex": weights}, convention="paper")

@@ -177,7 +177,7 @@ FAULTS = {
     "damaged picture": ("a 3.png: expected a readable picture", damaged),
     "mixed sizes": ("a 4.png: the picture is 30x24 pixels; expected 32x24 as a 0.png", mixed),
     "output exists": ("out: exists already", taken),
-    "work of others": ("out.partial: is not what prepare left there", foreign),
+    "work of others": ("out.partial: exists, but prepare has not written it", foreign),
 }
 
 

@@ -111,7 +111,7 @@ def test_frames_of_other_options_are_not_mixed(base, tmp_path, capsys):
     (tmp_path / "spiral" / "render.json").unlink()
     with pytest.raises(SystemExit):
         command_line.run(main, [*arguments, "--frames", "2"])
-    assert "holds frames, but no render.json" in capsys.readouterr().err
+    assert "holds frames without a render.json" in capsys.readouterr().err
 
 
 def test_exr_holds_linear_light_and_plain_numbers(base, tmp_path):

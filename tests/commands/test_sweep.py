@@ -187,4 +187,4 @@ def test_a_member_that_diverges_is_frozen_and_reported(start, whole, study, tmp_
         same = next(member for key, member in found.items() if key[3:] == name[3:])
         assert same["scores"]["lowlight"] == same_scores(expected)
     frozen = next(folder for folder in (tmp_path / "out").glob("*wild"))
-    assert json.loads((frozen / running.DIVERGED).read_text())["step"] == int(runs.open_run(frozen).state.step)
+    assert json.loads((frozen / running.DIVERGED_FILE).read_text())["step"] == int(runs.open_run(frozen).state.step)

@@ -18,7 +18,7 @@ from l2dgs_jax import train
 from l2dgs_jax.model.networks import init_bafe
 from l2dgs_jax.runtime import command_line
 from l2dgs_jax.view import main
-from l2dgs_jax.viewer.panel import NAMES
+from l2dgs_jax.viewer.panel import OUTPUT_NAMES
 
 PICTURE = np.s_[160:, :-340]  # above it viser may have something to say, beside it are the controls
 
@@ -95,10 +95,10 @@ def test_a_browser_shows_what_its_controls_say(tmp_path):
                 assert dark.mean() + 10 < last.mean() < bright.mean() - 10
                 page.enter("Brightness", "1")
                 maps = [changed(page, dark)]
-                for name in list(NAMES)[1:]:
+                for name in list(OUTPUT_NAMES)[1:]:
                     page.choose("Show", name)
                     maps.append(changed(page, maps[-1]))
-                assert len({shown.tobytes() for shown in maps}) == len(NAMES)
+                assert len({shown.tobytes() for shown in maps}) == len(OUTPUT_NAMES)
 
                 page.click("Filmed frames")
                 page.click("Play")

@@ -65,7 +65,7 @@ def test_instants_are_the_files_or_run_evenly(tmp_path, key):
         ([entry(), entry(fov="left out")], {}, "camera 2 of 2: 'fov' is missing; expected a number"),
         ([entry(fov=180)], {}, "camera 1 of 1: 'fov' is 180; expected degrees between 0 and 180"),
         ([entry(camera_to_world=POSE[:12])], {}, "expected 16 numbers"),
-        ([entry(camera_to_world=[2 * x for x in POSE])], {}, "'camera_to_world' is no rotation"),
+        ([entry(camera_to_world=[2 * x for x in POSE])], {}, "'camera_to_world' is not a rotation"),
         ([entry(camera_to_world=[*POSE[:15], 2.0])], {}, "the last row of 'camera_to_world'"),
         ([entry(time=0.0), entry(time=1.5)], {}, "camera 2 of 2: 'time' is 1.5; expected an instant from 0 to 1"),
         ([entry(render_time=-0.1)], {}, "'render_time' is -0.1; expected an instant from 0 to 1"),

@@ -184,7 +184,7 @@ FAULTS = {
     "an infinite position": ("images.bin: the pose of", poke("images", 44, "d", np.inf)),
     "a camera that is not there": ("'000000.png' has camera 9; expected", poke("images", 68, "I", 9)),
     "a name in another code": ("is not UTF-8", poke("images", 72, "B", 255)),
-    "a missing picture": ("holds 9 pictures, but none of 1 of the 8", lambda s: (s / "images/000003.png").unlink()),
+    "a missing picture": ("holds 9 pictures, but none for 1 of the 8", lambda s: (s / "images/000003.png").unlink()),
     "no pictures": ("images: no such folder", lambda s: shutil.rmtree(s / "images")),
     "an unknown model in text": ("camera model WIDE is not", text("cameras", "# c\n1 WIDE 32 24 1 2 3\n")),
     "too few parameters": ("has 2 parameters; expected 4 for PINHOLE", text("cameras", "1 PINHOLE 32 24 1 2\n")),

@@ -70,8 +70,11 @@ FAULTS = {
     "infinite rotation": (f"{CAMERA}: 'orientation' is", damage(CAMERA, orientation=rotation_with(float("inf")))),
     "vector of another length": (f"{CAMERA}: 'position' is", damage(CAMERA, position=[0, 0])),
     "ragged matrix": (f"{CAMERA}: 'orientation' is", damage(CAMERA, orientation=[[1, 0, 0], [0, 1], [0, 0, 1]])),
-    "reflection": (f"{CAMERA}: 'orientation' is no rotation", damage(CAMERA, orientation=rotation_with(-1))),
-    "stretched rotation": (f"{CAMERA}: 'orientation' is no rotation", damage(CAMERA, orientation=rotation_with(1.1))),
+    "reflection": (f"{CAMERA}: 'orientation' is not a rotation", damage(CAMERA, orientation=rotation_with(-1))),
+    "stretched rotation": (
+        f"{CAMERA}: 'orientation' is not a rotation",
+        damage(CAMERA, orientation=rotation_with(1.1)),
+    ),
     "no focal length": (f"{CAMERA}: 'focal_length' is 0.0", damage(CAMERA, focal_length=0)),
     "no aspect": (f"{CAMERA}: 'focal_length'", damage(CAMERA, pixel_aspect_ratio=0)),
     "flat scene": ("scene.json: 'scale' is 0.0", damage("scene.json", scale=0)),

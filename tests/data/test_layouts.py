@@ -20,7 +20,7 @@ def test_pictures_that_differ_in_their_suffix_only(tmp_path):
         if kind in ("colmap", "transforms"):  # these say which is meant
             assert data.load_dataset(tmp_path / kind).train.images.max() < 0.5
         else:
-            with pytest.raises(UserError, match=r"000003\.jpg: is 000003\.png under another suffix; expected one"):
+            with pytest.raises(UserError, match=r"000003\.jpg: differs from 000003\.png only in its suffix; expected"):
                 data.load_dataset(tmp_path / kind)
 
 

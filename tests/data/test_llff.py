@@ -46,8 +46,8 @@ def test_random_points_lie_between_the_bounds_of_some_view(scene):
     bounds = np.load(scene / "poses_bounds.npy")[:, 15:]
     dataset = data.load_dataset(scene)
     assert "no point cloud" in dataset.notes[0]
-    assert len(dataset.points) == clouds.COUNT
-    seen = np.zeros(clouds.COUNT, bool)
+    assert len(dataset.points) == clouds.RANDOM_POINTS
+    seen = np.zeros(clouds.RANDOM_POINTS, bool)
     for split in (dataset.train, dataset.test):
         for viewmat, K in zip(split.cameras.viewmat, split.cameras.K, strict=True):
             local = dataset.points @ viewmat[:3, :3].T + viewmat[:3, 3]
@@ -75,7 +75,7 @@ FAULTS = {
     "no pictures": ("images: no such folder", lambda s: shutil.rmtree(s / "images")),
     "bounds the wrong way": ("row 2: size 32.0x24.0, focal length 38.4", lambda s: edit(s, 2, 16, 1e-3)),
     "no focal length": ("row 2: size", lambda s: edit(s, 2, 14, 0)),
-    "a stretched pose": ("row 2: the pose is no rotation", lambda s: edit(s, 2, 0, 9)),
+    "a stretched pose": ("row 2: the pose is not a rotation", lambda s: edit(s, 2, 0, 9)),
     "NaN": ("holds NaN", lambda s: edit(s, 2, 0, np.nan)),
 }
 

@@ -18,7 +18,7 @@ from experiments.members import labels
 from l2dgs_jax import metrics
 from l2dgs_jax.config import PRESETS, overrides
 from l2dgs_jax.errors import UserError
-from l2dgs_jax.metrics.lpips import SMALLEST
+from l2dgs_jax.metrics.lpips import SMALLEST_SIDE
 from l2dgs_jax.study import report, running, spec
 
 ROOT = Path(__file__).parents[2]
@@ -144,13 +144,13 @@ def test_what_diverged_is_in_no_mean_and_is_named(tmp_path, capsys):
 @pytest.mark.slow
 def test_weights_of_lpips_fill_its_columns_of_what_was_scored_without(tmp_path, tmp_path_factory, monkeypatch):
     monkeypatch.setitem(metrics.NETWORKS, "alex", networks.TINY)
-    monkeypatch.setitem(SMALLEST, "alex", 1)
+    monkeypatch.setitem(SMALLEST_SIDE, "alex", 1)
     np.savez(tmp_path / "tiny.npz", **networks.state_dict("alex"))
     out = tmp_path / "out"
     members = [member("mochi", "a", 0, 5.0), member("mochi", "a", 1, 5.0, ended="diverged at step 7")]
     for one in members:
         shutil.copytree(finished_run.folder(tmp_path_factory.getbasetemp()), out / one["name"])
-        (out / one["name"] / report.RESULT).write_text(json.dumps(one))
+        (out / one["name"] / report.RESULT_FILE).write_text(json.dumps(one))
     names = [one["name"] for one in members]
     monkeypatch.setattr(running, "run_study", lambda *_, **__: report.write(out, names))
     study = tmp_path / "study.toml"

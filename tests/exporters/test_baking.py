@@ -81,7 +81,7 @@ def test_splats_are_the_living_gaussians_with_colours_in_range(run, baked):
 
 
 def test_the_fit_brings_colours_closer_at_every_instant(run, baked, monkeypatch):
-    monkeypatch.setattr(baking, "FIRST_ROUNDS", 0)
+    monkeypatch.setattr(baking, "FIRST_ITERATIONS", 0)
     (unfitted,) = next(baking.bake(run, TIMES))
     unfitted = baking.closeness(run, unfitted, TIMES[0])
     assert all(baking.closeness(run, *splats, time) > unfitted + 3 for splats, time in zip(baked, TIMES, strict=True))

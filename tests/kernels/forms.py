@@ -22,7 +22,7 @@ def form(name, monkeypatch):
             yield
         return
     jax.clear_caches()  # what was compiled with the forms for CPUs must not be found again
-    monkeypatch.setattr(selection, "TRIED", False)
+    monkeypatch.setattr(selection, "TESTED", False)
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "jaxlib .* was not tried", RuntimeWarning)
         yield

@@ -8,9 +8,9 @@ from jax.test_util import check_grads
 
 from l2dgs_jax.kernels import use_kernels
 from l2dgs_jax.kernels.blend import accelerator, blend
-from l2dgs_jax.kernels.tiles import TILE, TileLists
+from l2dgs_jax.kernels.tiles import TILE_SIZE, TileLists
 
-WIDTH, HEIGHT = 5 * TILE - 3, 2 * TILE
+WIDTH, HEIGHT = 5 * TILE_SIZE - 3, 2 * TILE_SIZE
 TILES, COUNT, CHANNELS = 10, 30, 3
 LENGTHS = [7, 0, 25, 1, 0, 13, 4, 0, 9, 2]  # of the lists; some are longer than a chunk
 
@@ -39,12 +39,12 @@ compiled = jax.jit(with_gradient)
 
 def one_by_one(packed, lists):
     """Every pixel on its own."""
-    packed, columns = np.asarray(packed), -(-WIDTH // TILE)
-    image = np.zeros((TILES, CHANNELS, TILE * TILE))
+    packed, columns = np.asarray(packed), -(-WIDTH // TILE_SIZE)
+    image = np.zeros((TILES, CHANNELS, TILE_SIZE * TILE_SIZE))
     for tile, (start, stop) in enumerate(zip(lists.starts, lists.stops, strict=True)):
-        for pixel in range(TILE * TILE):
-            x = TILE * (tile % columns) + pixel % TILE + 0.5
-            y = TILE * (tile // columns) + pixel // TILE + 0.5
+        for pixel in range(TILE_SIZE * TILE_SIZE):
+            x = TILE_SIZE * (tile % columns) + pixel % TILE_SIZE + 0.5
+            y = TILE_SIZE * (tile // columns) + pixel // TILE_SIZE + 0.5
             light = 1.0
             for mx, my, a, b, c, opacity, *features in packed[np.asarray(lists.gaussians[start:stop])]:
                 dx, dy = x - mx, y - my
@@ -68,7 +68,7 @@ def test_the_reference_is_the_definition():
 
 def assert_the_reference():
     packed, lists = case()
-    cotangent = jnp.asarray(np.random.default_rng(1).normal(size=(TILES, CHANNELS, TILE * TILE)))
+    cotangent = jnp.asarray(np.random.default_rng(1).normal(size=(TILES, CHANNELS, TILE_SIZE * TILE_SIZE)))
     actual = compiled(packed, lists, cotangent)
     with use_kernels("reference"):
         expected = compiled(packed, lists, cotangent)
@@ -82,9 +82,9 @@ def test_every_form_is_the_reference(any_way):
 
 @pytest.mark.parametrize("block", [3, 5])
 def test_blocks_that_are_full_and_that_are_not(monkeypatch, block):
-    monkeypatch.setattr(accelerator, "BLOCK", block)
+    monkeypatch.setattr(accelerator, "BLOCK_SIZE", block)
     packed, lists = case(seed=block)
-    cotangent = jnp.ones((TILES, CHANNELS, TILE * TILE))
+    cotangent = jnp.ones((TILES, CHANNELS, TILE_SIZE * TILE_SIZE))
     with use_kernels("accelerator"):
         actual = jax.jit(lambda *arrays: with_gradient(*arrays))(packed, lists, cotangent)  # with these blocks
     with use_kernels("reference"):
@@ -96,7 +96,7 @@ def test_blocks_that_are_full_and_that_are_not(monkeypatch, block):
 def test_a_single_gaussian(any_form):
     packed, lists = case()
     alone = lists._replace(gaussians=0 * lists.gaussians, stops=jnp.minimum(lists.stops, lists.starts + 1))
-    value, gradient = compiled(packed[:1], alone, jnp.ones((TILES, CHANNELS, TILE * TILE)))
+    value, gradient = compiled(packed[:1], alone, jnp.ones((TILES, CHANNELS, TILE_SIZE * TILE_SIZE)))
     np.testing.assert_allclose(value, one_by_one(packed[:1], alone), atol=1e-12)
     assert np.isfinite(gradient).all()
 
@@ -104,7 +104,7 @@ def test_a_single_gaussian(any_form):
 def test_batches_are_one_larger_image(any_form):
     cases = [case(seed) for seed in range(2)]
     packed, lists = (jax.tree.map(lambda *x: jnp.stack(x), *x) for x in zip(*cases, strict=True))
-    cotangent = jnp.ones((TILES, CHANNELS, TILE * TILE))
+    cotangent = jnp.ones((TILES, CHANNELS, TILE_SIZE * TILE_SIZE))
     together = jax.jit(jax.vmap(with_gradient, (0, 0, None)))(packed, lists, cotangent)
     with use_kernels("reference"):
         alone = [compiled(*arrays, cotangent) for arrays in cases]
@@ -115,11 +115,11 @@ def test_batches_are_one_larger_image(any_form):
 def test_no_gaussian_at_all(any_form):
     packed, lists = case()
     nothing = TileLists(lists.gaussians[:1], 0 * lists.starts, 0 * lists.stops)
-    value, gradient = with_gradient(packed[:0], nothing, jnp.ones((TILES, CHANNELS, TILE * TILE)))
+    value, gradient = with_gradient(packed[:0], nothing, jnp.ones((TILES, CHANNELS, TILE_SIZE * TILE_SIZE)))
     assert not value.any()
     assert gradient.shape == (0, packed.shape[1])
     # Empty lists of Gaussians that exist.
-    value, gradient = compiled(packed, nothing, jnp.ones((TILES, CHANNELS, TILE * TILE)))
+    value, gradient = compiled(packed, nothing, jnp.ones((TILES, CHANNELS, TILE_SIZE * TILE_SIZE)))
     assert not value.any()
     assert not gradient.any()
 

@@ -68,8 +68,8 @@ def test_batches_in_any_axis_and_shared_arguments():
 
 
 def test_an_untried_compiler_gets_the_general_form_and_says_so_once(monkeypatch):
-    monkeypatch.setattr(selection, "TRIED", False)
-    selection._warn_of_untried_compiler.cache_clear()
+    monkeypatch.setattr(selection, "TESTED", False)
+    selection._warn_of_untested_compiler.cache_clear()
     with pytest.warns(RuntimeWarning, match=r"jaxlib .* was not tried .*; expected jaxlib 0\.10"):
         np.testing.assert_array_equal(jax.jit(lambda x: add(x, Y))(X), X + 5)
     # Warnings are errors here: a second one would fail.
@@ -89,13 +89,13 @@ def test_the_environment_sets_the_form_of_a_process(value, constant):
         "print(by_form(jnp.zeros(()), reference=f(1), cpu=f(2), accelerator=f(4), like=jnp.zeros(())))"
     )
     done = subprocess.run(
-        [sys.executable, "-c", program], env={"PATH": "", selection.VARIABLE: value}, capture_output=True, text=True
+        [sys.executable, "-c", program], env={"PATH": "", selection.ENV_VARIABLE: value}, capture_output=True, text=True
     )
     assert float(done.stdout) == constant, done.stderr
 
 
 def test_a_misspelt_environment_is_one_sentence(monkeypatch):
-    monkeypatch.setenv(selection.VARIABLE, "fast")
+    monkeypatch.setenv(selection.ENV_VARIABLE, "fast")
     selection._from_environment.cache_clear()
     with pytest.raises(UserError, match="L2DGS_JAX_KERNELS is 'fast'; expected one of reference, cpu, accelerator"):
         add(X, Y)

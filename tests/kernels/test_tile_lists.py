@@ -6,7 +6,7 @@ import numpy as np
 
 from l2dgs_jax.kernels import use_kernels
 from l2dgs_jax.kernels.tile_lists import list_pairs
-from l2dgs_jax.kernels.tiles import TILE, Tiling
+from l2dgs_jax.kernels.tiles import TILE_SIZE, Tiling
 
 VIEWS, COLUMNS, ROWS, COUNT = 2, 5, 4, 12
 NOWHERE = VIEWS * COLUMNS * ROWS
@@ -16,11 +16,11 @@ def gaussians(count=COUNT, seed=0):
     """Boxes that are larger than the ellipses, some of them empty."""
     random = np.random.default_rng(seed)
     size = VIEWS * count
-    mean = random.uniform(0, [TILE * COLUMNS, TILE * ROWS], (size, 2))
+    mean = random.uniform(0, [TILE_SIZE * COLUMNS, TILE_SIZE * ROWS], (size, 2))
     spread = random.uniform(1, 8, (size, 2))
     slant = random.uniform(-0.9, 0.9, size)
     conic = np.stack([1 / spread[:, 0] ** 2, slant / spread.prod(1), 1 / spread[:, 1] ** 2], axis=1)
-    first = np.clip(np.floor((mean - 12) / TILE), 0, [COLUMNS - 1, ROWS - 1]).astype(np.int32)
+    first = np.clip(np.floor((mean - 12) / TILE_SIZE), 0, [COLUMNS - 1, ROWS - 1]).astype(np.int32)
     counts = np.minimum(random.integers(0, 5, (size, 2)), [COLUMNS, ROWS] - first).astype(np.int32)
     box = np.concatenate([first, counts], axis=1)
     ellipse = np.concatenate([mean, conic, random.uniform(0.5, 4, (size, 1))], axis=1)
@@ -46,7 +46,7 @@ def test_pairs_are_those_that_touch(any_way):
             for line in range(top, top + height):
                 # The continuous rectangle between pixel centres, finely sampled.
                 u, v = np.meshgrid(
-                    *(TILE * k + 0.5 + np.linspace(0, TILE - 1, 141) - m for k, m in ((column, x), (line, y)))
+                    *(TILE_SIZE * k + 0.5 + np.linspace(0, TILE_SIZE - 1, 141) - m for k, m in ((column, x), (line, y)))
                 )
                 q = a * u * u + 2 * b * u * v + c * v * v
                 if q.min() <= reach:

@@ -13,7 +13,7 @@ import l2dgs_jax
 from l2dgs_jax import metrics
 from l2dgs_jax.data.images import read_image
 from l2dgs_jax.metrics import NETWORKS
-from l2dgs_jax.metrics.lpips import SMALLEST
+from l2dgs_jax.metrics.lpips import SMALLEST_SIDE
 from l2dgs_jax.runs.lpips_weights import find_lpips, load_lpips
 
 WIDTH = 46  # pixels
@@ -76,7 +76,7 @@ def measure(network, arrays, tmp_path_factory):
 
 
 def test_it_is_the_transcription_whole_and_of_regions(network, arrays, measure):
-    a, b = pair(SMALLEST[network], WIDTH)
+    a, b = pair(SMALLEST_SIDE[network], WIDTH)
     expected = maps_in_numpy(network, arrays, a, b)
     mask = np.zeros(a.shape[:2], bool)
     mask[:, :30] = True
@@ -96,7 +96,7 @@ def test_it_is_the_transcription_whole_and_of_regions(network, arrays, measure):
 
 
 def test_images_that_the_last_layer_does_not_see_have_none(network, measure):
-    for height, known in ((SMALLEST[network], True), (SMALLEST[network] - 1, False)):
+    for height, known in ((SMALLEST_SIDE[network], True), (SMALLEST_SIDE[network] - 1, False)):
         score = metrics.compare(*pair(height, WIDTH), measures={"lpips": measure})["overall"]["lpips"]
         assert (score is not None) == known
 

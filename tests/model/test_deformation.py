@@ -266,7 +266,7 @@ def test_the_motion_field_acts_on_those_whose_gates_are_open_widest():
             (True, CFG, {}),
             (True, part, {}),
             (True, part, {"alive": alive}),
-            (True, part, {"chances": jnp.where(jnp.arange(N) % 2 == 1, 9.0, 0.0)}),
+            (True, part, {"gate_noise": jnp.where(jnp.arange(N) % 2 == 1, 9.0, 0.0)}),
         )
     )
     odd = np.array([1, 3, 5])

@@ -26,12 +26,12 @@ def test_observed_colors_take_the_median_over_frames():
     np.testing.assert_allclose(colors, 0.2, rtol=1e-6)
 
 
-@pytest.mark.parametrize("at_once", [observation.SEEN_AT_ONCE, 40])
+@pytest.mark.parametrize("at_once", [observation.VALUES_IN_MEMORY, 40])
 def test_observed_colors_are_the_same_when_few_are_held_at_once(monkeypatch, at_once):
     rng = np.random.default_rng(4)
     images, valid = rng.uniform(size=(7, 12, 16, 3)).astype(np.float16), rng.random((7, 12, 16)) < 0.6
     spread = cameras(rng.uniform([-2, -1, -2], [2, 1, 3], (7, 3)))
-    monkeypatch.setattr(observation, "SEEN_AT_ONCE", at_once)
+    monkeypatch.setattr(observation, "VALUES_IN_MEMORY", at_once)
     colors = observation.observed_colors(POINTS, spread, images, valid)
 
     local = np.einsum("fij,pj->fpi", spread.viewmat[:, :3, :3], POINTS) + spread.viewmat[:, None, :3, 3]

@@ -37,7 +37,7 @@ def test_training_frames_are_brighter_and_the_others_as_they_were(dataset, metho
 def test_a_gamma_is_one_exponent_that_brings_even_frames_to_mid_grey(dataset):
     flat = dataclasses.replace(dataset.train, images=np.full_like(dataset.train.images, 0.05))
     images = enhanced(dataclasses.replace(dataset, train=flat), "gamma").train.images
-    np.testing.assert_allclose(images, enhancement.LEVEL, rtol=2e-3)
+    np.testing.assert_allclose(images, enhancement.TARGET_MEAN, rtol=2e-3)
 
 
 def test_zero_dce_has_the_parameters_and_the_curve_of_its_paper():

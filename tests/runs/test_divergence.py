@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from l2dgs_jax.runs.divergence import EXPLOSION, STEADY, SUSTAINED, explosion
+from l2dgs_jax.runs.divergence import EXPLODED_LINES, EXPLOSION_FACTOR, USUAL_LINES, explosion
 
 # Of the trainings that went well, those that come nearest to an explosion: every tenth step, start of the fine stage,
 # births and clones included.
@@ -25,15 +25,15 @@ def test_no_alarm_in_a_training_that_goes_well(name):
 @pytest.mark.parametrize("part", [0.1, 0.3, 0.9])
 def test_an_explosion_is_noticed_at_once(name, part):
     losses = CURVES[name]
-    start = max(STEADY, int(part * len(losses)))
-    exploded = losses[:start] + [2 * EXPLOSION * max(losses)] * 20
-    assert first_alarm(exploded) == start + SUSTAINED
+    start = max(USUAL_LINES, int(part * len(losses)))
+    exploded = losses[:start] + [2 * EXPLOSION_FACTOR * max(losses)] * 20
+    assert first_alarm(exploded) == start + EXPLODED_LINES
     creeping = losses[:start] + [losses[start - 1] * 1.2**step for step in range(30)]
     assert first_alarm(creeping)
 
 
 def test_a_few_bad_views_are_no_explosion():
-    assert first_alarm([1.0] * 50 + [1000.0] * (SUSTAINED - 1) + [1.0] * 50) is None
+    assert first_alarm([1.0] * 50 + [1000.0] * (EXPLODED_LINES - 1) + [1.0] * 50) is None
 
 
 def test_a_factor_is_told():

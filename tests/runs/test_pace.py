@@ -26,21 +26,21 @@ def told(monkeypatch, config, durations, gaussians=10_000, done=0):
 
 def test_a_fine_step_is_dearer_than_a_coarse_one_before_any_is_timed(monkeypatch):
     config = tiny(coarse_steps=100, fine_steps=300, density=STILL)
-    left, expected = told(monkeypatch, config, np.where(np.arange(400) < 100, 0.1, 0.1 * pace.FINE))
+    left, expected = told(monkeypatch, config, np.where(np.arange(400) < 100, 0.1, 0.1 * pace.FINE_STEP))
     np.testing.assert_allclose(left[1:], expected[1:], atol=1e-6)
 
 
 def test_a_stage_that_takes_longer_than_thought_is_believed_once_it_is_timed(monkeypatch):
     config = tiny(coarse_steps=100, fine_steps=300, density=STILL)
     left, expected = told(monkeypatch, config, np.where(np.arange(400) < 100, 0.1, 0.5))
-    np.testing.assert_allclose(left[100 + pace.RECENT :], expected[100 + pace.RECENT :], atol=1e-6)
+    np.testing.assert_allclose(left[100 + pace.TIMED_STEPS :], expected[100 + pace.TIMED_STEPS :], atol=1e-6)
 
 
 def test_births_ahead_are_counted(monkeypatch):
     config = tiny(coarse_steps=20, fine_steps=480, density=BIRTHS)
     births = 3 ** (np.arange(1, 7) / 6).repeat(50)  # after steps 100, 150 ... 350 of the fine stage
     gaussians = 10_000 * np.concatenate([np.ones(120), births, np.full(80, 3.0)])
-    durations = 1e-5 * (pace.STANDING + gaussians) * np.where(np.arange(500) < 20, 1, pace.FINE)
+    durations = 1e-5 * (pace.FIXED_COST + gaussians) * np.where(np.arange(500) < 20, 1, pace.FINE_STEP)
     left, expected = told(monkeypatch, config, durations)
     assert left[30] == pytest.approx(expected[30], rel=1e-3)
     unaware = (500 - 31) * durations[30]
@@ -56,5 +56,5 @@ def test_compilations_and_checkpoints_do_not_count(monkeypatch, done):
         durations[40 - done] = 30
     left, _ = told(monkeypatch, config, durations, done=done)
     assert left[0] is None
-    assert max(left[1:]) < 0.1 * pace.FINE * 100
+    assert max(left[1:]) < 0.1 * pace.FINE_STEP * 100
     assert left[-1] == 0

@@ -13,7 +13,7 @@ from l2dgs_jax.data.images import to_bytes
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.runs import METRICS, previews, report
 from l2dgs_jax.runs.report import REPORT, Report
-from l2dgs_jax.runs.tensorboard import EVENTS, TensorBoard
+from l2dgs_jax.runs.tensorboard import EVENTS_FOLDER, TensorBoard
 
 STEPS = 1200
 
@@ -96,7 +96,7 @@ def test_steps_write_the_page_now_and_then_only(tmp_path, monkeypatch):
     for step in range(1, 101):
         now += 1
         display("step", step=step, stage="coarse", left=None)
-    assert len(written) == 1 + 100 // report.INTERVAL
+    assert len(written) == 1 + 100 // report.WRITE_INTERVAL
 
 
 def test_a_page_that_cannot_be_written_ends_no_training(tmp_path):
@@ -111,7 +111,7 @@ def test_a_long_run_is_thinned_and_what_is_not_finite_is_a_gap():
     lines[-1]["psnr"] = float("inf")
     del lines[-6]["rates"]
     curves = report.curves(lines)
-    assert report.POINTS <= len(curves["step"]) < 2 * report.POINTS
+    assert report.CURVE_POINTS <= len(curves["step"]) < 2 * report.CURVE_POINTS
     assert curves["step"][-1] == 23_000
     assert curves["psnr"][-1] is None
     assert curves["rates"]["means"][-2] is None
@@ -140,7 +140,7 @@ def test_tensorboard_has_scalars_and_pictures_and_forgets_lost_steps(tmp_path):
     train(display, tmp_path, 30, 60)
     display("end", code=0)
     tags, purged = {}, []
-    for path in sorted((tmp_path / EVENTS).iterdir()):
+    for path in sorted((tmp_path / EVENTS_FOLDER).iterdir()):
         for event in events(path):
             if event.session_log.status:
                 purged.append(event.step)

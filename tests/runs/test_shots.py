@@ -54,7 +54,7 @@ def test_a_file_has_its_own_size_and_rate(run, tmp_path):
     assert (wanted.title, wanted.size, wanted.fps) == ("tour", (80, 60), 12.5)
     np.testing.assert_allclose(wanted.cameras.K[0, 1, 1], 30, rtol=1e-6)
     (tmp_path / "plain.json").write_text(json.dumps(content))
-    assert shots.of_file(run, tmp_path / "plain.json").fps == shots.RATE
+    assert shots.of_file(run, tmp_path / "plain.json").fps == shots.DEFAULT_FPS
     half = wanted.resized((40, 30))
     assert half.size == (40, 30)
     np.testing.assert_allclose(half.cameras.K[0], [[15, 0, 20], [0, 15, 15], [0, 0, 1]], rtol=1e-6)

@@ -8,7 +8,7 @@ import threading
 
 import pytest
 
-from l2dgs_jax.runtime.signals import STOPPING, stop_requests
+from l2dgs_jax.runtime.signals import STOP_SIGNALS, stop_requests
 
 
 @pytest.fixture(autouse=True)
@@ -19,7 +19,7 @@ def heeded():
     signal.signal(signal.SIGINT, before)
 
 
-@pytest.mark.parametrize("number", STOPPING)
+@pytest.mark.parametrize("number", STOP_SIGNALS)
 def test_a_signal_is_a_request_and_its_handler_comes_back(number):
     noticed, before = threading.Event(), signal.getsignal(number)
     with stop_requests(noticed.set) as stopping:

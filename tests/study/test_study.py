@@ -80,7 +80,7 @@ def test_scenes_alone_are_a_study(study):
 @pytest.mark.parametrize(
     ("text", "naming"),
     [
-        ("scenes = [", "no TOML"),
+        ("scenes = [", "not TOML"),
         ("", "scenes"),
         ("scenes = []", "scenes"),
         ('scenes = "a"', "scenes"),
@@ -193,7 +193,7 @@ def test_a_folder_is_not_taken_from_others(refused, tmp_path):
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "notes.txt").touch()
     assert "already holds" in refused()
-    (tmp_path / "out" / running.PLANS).write_text("[]")
+    (tmp_path / "out" / running.PLANS_FILE).write_text("[]")
     assert "other members" in refused("--resume")
 
 
@@ -234,7 +234,7 @@ def test_the_table_shows_what_was_varied_and_scored(tmp_path):
     ]
     for name, result in zip("xy", results, strict=True):
         (tmp_path / name).mkdir()
-        (tmp_path / name / report.RESULT).write_text(json.dumps(result))
+        (tmp_path / name / report.RESULT_FILE).write_text(json.dumps(result))
         lines = [json.dumps({"step": step, "psnr": 20 + np.log(step)}) + "\n" for step in (1, 10, 20)]
         (tmp_path / name / runs.METRICS).write_text("".join(lines))
     assert report.write(tmp_path, "xy") == [report.JSON, report.MARKDOWN, report.PLOTS]

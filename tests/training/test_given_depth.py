@@ -8,7 +8,7 @@ from jax.test_util import check_grads
 from scipy.optimize import minimize
 
 from l2dgs_jax.training import given_depth
-from l2dgs_jax.training.given_depth import TOLERANCE, depth_disagreement
+from l2dgs_jax.training.given_depth import HUBER_DELTA, depth_disagreement
 
 V, H, W = 2, 6, 8
 disagreement = jax.jit(depth_disagreement)
@@ -35,7 +35,7 @@ def expected(depth, alpha, given):
         y, x = y / y.mean(), x / x.mean()
 
         def cost(line, x=x, y=y):
-            return TOLERANCE * (np.sqrt(1 + ((y - abs(line[0]) * x - line[1]) / TOLERANCE) ** 2) - 1).sum()
+            return HUBER_DELTA * (np.sqrt(1 + ((y - abs(line[0]) * x - line[1]) / HUBER_DELTA) ** 2) - 1).sum()
 
         total += minimize(cost, (1, 0), method="Nelder-Mead", options={"xatol": 1e-9, "fatol": 1e-12}).fun
     return total / np.size(depth)
@@ -68,7 +68,7 @@ def test_gradients(monkeypatch):
     """They are those of the least mean; the search comes as close to it as its rounds allow."""
     depth, alpha, told = views()
     near = jax.grad(depth_disagreement, (0, 1))(depth, alpha, told)
-    monkeypatch.setattr(given_depth, "ROUNDS", 1000)
+    monkeypatch.setattr(given_depth, "FIT_ITERATIONS", 1000)
     function = jax.jit(lambda depth, alpha: depth_disagreement(depth, alpha, told))
     check_grads(function, (depth, alpha), order=1, modes=("rev",), eps=1e-6, atol=1e-7, rtol=1e-5)
     for x, y in zip(near, jax.grad(function, (0, 1))(depth, alpha), strict=True):

@@ -163,6 +163,6 @@ def test_training_starts_from_points_that_were_added(monkeypatch):
 
 
 def test_depth_is_looked_for_in_as_many_frames_as_are_worth_it(monkeypatch):
-    monkeypatch.setattr(surfaces, "FRAMES", 4)
+    monkeypatch.setattr(surfaces, "MAX_FRAMES", 4)
     split, _ = filmed()
     np.testing.assert_allclose([m.viewmat for m in depth_maps(sparse(), split)], split.cameras.viewmat[[0, 3, 6, 9]])

@@ -13,8 +13,8 @@ from l2dgs_jax.data import load_dataset
 from l2dgs_jax.runs.pictures import Output
 from l2dgs_jax.types import Decomposition, RenderOutput
 from l2dgs_jax.viewer import panel
-from l2dgs_jax.viewer.guest import FRUSTA, Guest
-from l2dgs_jax.viewer.ladder import MOVING, ladder
+from l2dgs_jax.viewer.guest import MAX_FRUSTA, Guest
+from l2dgs_jax.viewer.ladder import SECONDS_MOVING, ladder
 from l2dgs_jax.viewer.renderers import Renderers
 from l2dgs_jax.viewer.stage import Stage
 
@@ -106,13 +106,13 @@ def test_a_later_state_takes_a_rendering(visit, renderers):
 
 def test_each_output_is_another_picture(visit):
     shown = []
-    for name in panel.NAMES:
+    for name in panel.OUTPUT_NAMES:
         visit.gui["Show"].move(name)
         shown.append(visit.look())
-    assert set(panel.NAMES.values()) == set(get_args(Output))
+    assert set(panel.OUTPUT_NAMES.values()) == set(get_args(Output))
     # In this scene L is R.
     different = {picture.tobytes() for picture in shown}
-    assert len(different) == len(panel.NAMES) - 1
+    assert len(different) == len(panel.OUTPUT_NAMES) - 1
 
 
 def test_the_curtain_is_dark_on_its_left_only(visit):
@@ -137,7 +137,7 @@ def test_brightness_brightens_and_can_be_taken_back(visit):
 
 def test_small_pictures_while_moving_and_large_ones_when_still(visit, renderers):
     smallest, largest = ladder(WINDOW)
-    renderers.seconds[largest] = 2 * MOVING
+    renderers.seconds[largest] = 2 * SECONDS_MOVING
     visit.look()
     assert renderers.asked[-1][1] == smallest
     assert visit.more
@@ -199,7 +199,7 @@ def test_the_filmed_frames_come_go_and_lead_to_their_places(dataset, visit, rend
     assert visit.client.depth is None
     visit.gui["Filmed frames"].move(True)
     names = dataset.train.names
-    assert len(visit.client.frusta) == min(FRUSTA, len(names))
+    assert len(visit.client.frusta) == min(MAX_FRUSTA, len(names))
     visit.look()
     assert visit.client.depth.shape == visit.client.pictures[-1].shape[:2]
     visit.client.frusta[3].move(1)

@@ -5,7 +5,7 @@ import math
 from hypothesis import given
 from hypothesis import strategies as st
 
-from l2dgs_jax.viewer.ladder import ASPECTS, MOVING, STEPS, ladder, sharper, while_moving
+from l2dgs_jax.viewer.ladder import ASPECTS, PIXEL_COUNTS, SECONDS_MOVING, ladder, sharper, while_moving
 
 WINDOWS = st.tuples(st.integers(1, 5000), st.integers(1, 5000))
 
@@ -16,13 +16,13 @@ def test_sizes_grow_until_they_fill_the_window(window):
     pixels = [width * height for width, height in sizes]
     assert pixels == sorted(set(pixels))
     assert all(side % 4 == 0 for size in sizes for side in size)
-    assert len(sizes) == len(STEPS) or pixels[-1] > 0.9 * math.prod(window)
-    assert len(sizes) == 1 or STEPS[len(sizes) - 2] < math.prod(window)
+    assert len(sizes) == len(PIXEL_COUNTS) or pixels[-1] > 0.9 * math.prod(window)
+    assert len(sizes) == 1 or PIXEL_COUNTS[len(sizes) - 2] < math.prod(window)
 
 
 def test_there_are_few_sizes():
     windows = [(width, height) for width in range(50, 4000, 50) for height in range(50, 2200, 50)]
-    assert len({size for window in windows for size in ladder(window)}) <= len(ASPECTS) * len(STEPS)
+    assert len({size for window in windows for size in ladder(window)}) <= len(ASPECTS) * len(PIXEL_COUNTS)
 
 
 @given(st.floats(0.5, 2.4))
@@ -36,8 +36,8 @@ def test_while_moving_the_largest_that_is_fast_enough(window, times):
     sizes = ladder(window)
     seconds = dict(zip(sizes, times, strict=False))
     size = while_moving(sizes, seconds)
-    assert seconds[size] <= MOVING or size == sizes[0]
-    assert all(seconds[other] > MOVING for other in sizes[sizes.index(size) + 1 :])
+    assert seconds[size] <= SECONDS_MOVING or size == sizes[0]
+    assert all(seconds[other] > SECONDS_MOVING for other in sizes[sizes.index(size) + 1 :])
 
 
 @given(WINDOWS)

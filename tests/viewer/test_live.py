@@ -49,7 +49,7 @@ def test_states_are_shown_from_the_fine_stage_on_now_and_then_and_to_those_who_l
 
     def step(number):
         state = run.state._replace(step=np.int32(number))
-        clock[0] += 0.75 * live.INTERVAL
+        clock[0] += 0.75 * live.LEAST_INTERVAL
         on_step(Progress(number, jax.tree.map(lambda x: jax.numpy.asarray(x)[None], state), None, 1024))
 
     with live.live(run.dataset, run.config, "127.0.0.1", 8080, told.append) as on_step:

@@ -5,7 +5,7 @@ import time
 
 import pytest
 
-from l2dgs_jax.viewer.turns import INTERVAL, REST, Turn, Turns
+from l2dgs_jax.viewer.turns import LEAST_INTERVAL, SHARPEN_AFTER, Turn, Turns
 
 
 class Clock:
@@ -39,7 +39,7 @@ def test_a_wish_during_a_drawing_is_another_picture_after_a_while(turns, clock):
     turns.ask(1)
     turn, wait = turns.next()
     assert turn is None
-    assert wait == pytest.approx(INTERVAL)
+    assert wait == pytest.approx(LEAST_INTERVAL)
     clock.now += wait + 1e-6
     assert turns.next()[0] == Turn(1, sharpen=False)
 
@@ -58,8 +58,8 @@ def test_pictures_are_sharpened_when_nothing_changes_and_nobody_waits(turns, clo
     turns.rest(1)
     turn, wait = turns.next()
     assert turn is None
-    assert wait == pytest.approx(REST)
-    clock.now += REST + 1e-6
+    assert wait == pytest.approx(SHARPEN_AFTER)
+    clock.now += SHARPEN_AFTER + 1e-6
     turns.ask(2)
     assert turns.next()[0] == Turn(2, sharpen=False)
     assert turns.next()[0] == Turn(1, sharpen=True)
@@ -71,11 +71,11 @@ def test_a_change_puts_sharpening_off(turns, clock):
     turns.ask(1)
     turns.next()
     turns.rest(1)
-    clock.now += REST - 0.01
+    clock.now += SHARPEN_AFTER - 0.01
     turns.ask(1)
     assert turns.next()[0] == Turn(1, sharpen=False)
     turns.rest(1)
-    clock.now += REST - 0.01
+    clock.now += SHARPEN_AFTER - 0.01
     assert turns.next()[0] is None
 
 

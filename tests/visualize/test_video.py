@@ -13,7 +13,7 @@ import pytest
 from l2dgs_jax.cameras import select_camera
 from l2dgs_jax.cameras.paths import space_time_path
 from l2dgs_jax.errors import UserError
-from l2dgs_jax.visualize.films import RATE, SECONDS, write_run_video
+from l2dgs_jax.visualize.films import DEFAULT_FPS, RUN_VIDEO_SECONDS, write_run_video
 from l2dgs_jax.visualize.video import open_video, video_path
 
 
@@ -121,8 +121,8 @@ def test_opencv_says_nothing_on_standard_error(tmp_path, monkeypatch, capfd):
 def test_the_video_of_a_run_moves(tmp_path, tmp_path_factory):
     run = finished_run.opened(tmp_path_factory.getbasetemp())
     frames, rate = by_opencv(write_run_video(run, tmp_path / "video"))
-    assert len(frames) == SECONDS * RATE
-    assert rate == RATE
+    assert len(frames) == RUN_VIDEO_SECONDS * DEFAULT_FPS
+    assert rate == DEFAULT_FPS
     assert frames[0].shape == (run.dataset.height, 2 * run.dataset.width, 3)
     assert frames.std(axis=(1, 2, 3)).min() > 1
     assert frames.std(axis=0).max() > 1

@@ -14,7 +14,7 @@ from l2dgs_jax.data import images
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.visualize import display
 from l2dgs_jax.visualize.contact_sheet import COLUMNS, contact_sheet
-from l2dgs_jax.visualize.sheet import CELL_WIDTHS, GAP, STRIP, cell, viridis
+from l2dgs_jax.visualize.sheet import CELL_WIDTHS, GAP, STRIP_HEIGHT, cell, viridis
 
 
 @pytest.fixture(scope="module")
@@ -36,17 +36,17 @@ def test_contact_sheet_shows_every_part_of_the_render(run):
     test, (height, width) = run.dataset.test, (run.dataset.height, run.dataset.width)
     factor = -(-CELL_WIDTHS[0] // width)
     cell_height, cell_width = factor * height, factor * width
-    line = STRIP + cell_height + GAP
+    line = STRIP_HEIGHT + cell_height + GAP
     rows = min(4, len(test.names))
     assert sheet.dtype == np.uint8
     assert sheet.shape == (
-        STRIP + rows * line,
+        STRIP_HEIGHT + rows * line,
         len(COLUMNS) * (cell_width + GAP),
         3,
     )
 
     def cell(row, column):
-        y = STRIP + row * line + STRIP
+        y = STRIP_HEIGHT + row * line + STRIP_HEIGHT
         x = COLUMNS.index(column) * (cell_width + GAP)
         block = sheet[y : y + cell_height, x : x + cell_width]
         small = block[::factor, ::factor]
@@ -68,7 +68,7 @@ def test_contact_sheet_shows_every_part_of_the_render(run):
         assert np.ptp(cell(row, "depth"), axis=(0, 1)).max() > 50
     for heading in range(len(COLUMNS)):
         x = heading * (cell_width + GAP)
-        assert sheet[:STRIP, x : x + cell_width].max() > 200
+        assert sheet[:STRIP_HEIGHT, x : x + cell_width].max() > 200
 
 
 def test_an_exponent_that_is_one_number_has_one_colour(run):
@@ -85,7 +85,7 @@ def test_contact_sheet_without_held_out_views_or_truth_shows_training_views(run)
     factor = -(-CELL_WIDTHS[0] // bare.dataset.width)
     width = factor * bare.dataset.width + GAP
     assert sheet.shape[1] == (len(COLUMNS) - 1) * width
-    top = 2 * STRIP
+    top = 2 * STRIP_HEIGHT
     first = sheet[top : top + factor * bare.dataset.height : factor, : width - GAP : factor]
     np.testing.assert_array_equal(first, np.rint(255 * bare.dataset.train.images[0].astype(np.float32)))
 

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from l2dgs_jax.kernels.blend import accelerator, cpu, reference
-from l2dgs_jax.kernels.blend.alpha import GEOMETRY, PIXELS
+from l2dgs_jax.kernels.blend.alpha import GEOMETRY_COLUMNS, PIXELS
 from l2dgs_jax.kernels.selection import by_form, functions_by_form
 from l2dgs_jax.kernels.tiles import TileLists
 
@@ -19,15 +19,16 @@ Residuals = tuple[Float[Array, "G D"], TileLists, Float[Array, "T C P"]]
 
 @partial(jax.custom_vjp, nondiff_argnums=(2, 3))
 def blend(packed: Float[Array, "G D"], lists: TileLists, width: int, height: int) -> Float[Array, "T C P"]:
-    """Blend the feature channels of every tile's list over its 8x8 pixels, nearest first.
+    """Blend the feature channels of every tile's list over its 8x8 pixels, nearest Gaussian first.
 
-    alpha = min(0.999, o exp(-q/2)), skipped below 1/255; the Gaussian that would bring the transmittance to 1e-4 or
-    less ends its pixel and is left out (3DGS, arXiv 2308.04079). Gradients flow to `packed`, reverse mode only; nothing
-    is stored for them but the result. A vmapped call blends the tiles of all members as one larger image.
+    alpha = min(0.999, o exp(-q/2)) with opacity o and q = d^T conic d, skipped below 1/255; the Gaussian that would
+    bring the transmittance to 1e-4 or less ends its pixel and is itself left out (3DGS, arXiv 2308.04079). Gradients
+    flow to `packed`, in reverse mode only; beyond the arguments, only the result is stored for them. A vmapped call
+    blends the tiles of all members as one larger image.
 
     Args:
-        packed: per Gaussian mean (2, pixels), conic (3), opacity, and C = D - 6 features.
-        lists: who may touch which tile.
+        packed: for each Gaussian, mean (2, pixels), conic (3), opacity, and C = D - 6 features.
+        lists: the Gaussians that may touch each tile.
         width: pixels.
         height: pixels.
     """
@@ -37,7 +38,7 @@ def blend(packed: Float[Array, "G D"], lists: TileLists, width: int, height: int
 def _forward(
     packed: Float[Array, "G D"], lists: TileLists, width: int, height: int
 ) -> tuple[Float[Array, "T C P"], Residuals]:
-    shape = lists.starts.shape[0], packed.shape[1] - GEOMETRY, PIXELS
+    shape = lists.starts.shape[0], packed.shape[1] - GEOMETRY_COLUMNS, PIXELS
     if not len(packed):
         output = jnp.zeros(shape, packed.dtype)
     else:
@@ -64,9 +65,9 @@ def _like(packed: Float[Array, "G D"], *shape: int) -> jax.ShapeDtypeStruct:
 def _folded(
     name: str, width: int, height: int, shape: Callable[..., jax.ShapeDtypeStruct]
 ) -> Callable[..., Float[Array, "..."]]:
-    """The function of that name in the right form; vmapped, it is called once, with the members one after the other.
+    """The function of that name in the right form; under vmap it is called once, for the members' tiles in one row.
 
-    A loop that is vmapped as it stands runs until its slowest member ends, and selects what to keep in every step.
+    The batching rule of a loop would run all members until the slowest ends, and select what to keep in every step.
     """
     size = {"width": width, "height": height}
     forms = functions_by_form(name, reference=reference, cpu=cpu, accelerator=accelerator, **size)

@@ -1,4 +1,4 @@
-"""Tiles that walk their lists together."""
+"""Blocks of tiles whose lists are walked together."""
 
 from typing import NamedTuple
 
@@ -6,11 +6,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 from numpy.typing import DTypeLike
 
-from l2dgs_jax.kernels.tiles import TILE, TileLists, grid
+from l2dgs_jax.kernels.tiles import TILE_SIZE, TileLists, grid
 
 
 class Block(NamedTuple):
-    """Tiles that walk their lists together: where their lists start and stop, and the middle of each tile."""
+    """Tiles whose lists are walked together: where their lists start and stop, and the middle of each tile."""
 
     starts: Int[Array, "*S B"]
     stops: Int[Array, "*S B"]
@@ -20,18 +20,18 @@ class Block(NamedTuple):
 def tile_centres(tiles: Int[Array, "*S"], width: int, height: int, dtype: DTypeLike) -> Float[Array, "*S 2"]:
     """The middle of each tile, pixels."""
     columns, rows = grid(width, height)
-    corners = TILE * jnp.stack([tiles % columns, tiles // columns % rows], axis=-1)
-    return corners.astype(jnp.dtype(dtype)) + TILE / 2
+    corners = TILE_SIZE * jnp.stack([tiles % columns, tiles // columns % rows], axis=-1)
+    return corners.astype(jnp.dtype(dtype)) + TILE_SIZE / 2
 
 
 def in_blocks(
     lists: TileLists, size: int, width: int, height: int, dtype: DTypeLike
 ) -> tuple[Block, Int[Array, "S B"], Int[Array, " T"]]:
-    """The tiles in blocks of one size, sorted by the lengths of their lists, which makes those of a block alike.
+    """The tiles in blocks of one size, sorted by the lengths of their lists, so that those of a block are similar.
 
     Returns:
-        The blocks; the tile that each of their entries stands for, empty lists of the first tile filling up the last
-        block; and the entry of each tile.
+        The blocks; the tile of each of their entries (the last block is filled up with empty lists of the first tile);
+        and the entry of each tile.
     """
     count = lists.starts.shape[0]
     size = min(size, count)

@@ -1,4 +1,4 @@
-"""Small blocks of tiles, one after the other in one native function: their pixels never leave the first cache."""
+"""Small blocks of tiles, one after the other in one native function: their pixels stay in the L1 cache."""
 
 from functools import partial
 from typing import Any
@@ -14,15 +14,15 @@ from l2dgs_jax.kernels.blend.walk import Chunking, Sums, add_moments, blend_bloc
 from l2dgs_jax.kernels.compilation import native_call
 from l2dgs_jax.kernels.tiles import TileLists
 
-BLOCK = 8  # tiles
+BLOCK_SIZE = 8  # tiles
 CHUNKING = Chunking(size=8, unroll=False)
 
 
 def blend(packed: Float[Array, "G D"], lists: TileLists, *, width: int, height: int) -> Float[Array, "T C P"]:
-    """See the contract."""
+    """See the contract in `__init__`."""
     if not _suits(packed, lists):
         return accelerator.blend(packed, lists, width=width, height=height)
-    blocks, _, position = in_blocks(lists, BLOCK, width, height, packed.dtype)
+    blocks, _, position = in_blocks(lists, BLOCK_SIZE, width, height, packed.dtype)
 
     def every_block(packed: Float[Array, "G D"], gaussians: Int[Array, " M"], blocks: Block) -> Float[Array, "S B C P"]:
         return jax.lax.map(lambda block: blend_block(packed, gaussians, block, CHUNKING), blocks)
@@ -40,10 +40,10 @@ def gradient(
     width: int,
     height: int,
 ) -> Float[Array, "G D"]:
-    """The gradient of `blend` in `packed`."""
+    """The gradient of `blend` with respect to `packed`."""
     if not _suits(packed, lists):
         return accelerator.gradient(packed, lists, output, cotangent, width=width, height=height)
-    blocks, tiles, _ = in_blocks(lists, BLOCK, width, height, packed.dtype)
+    blocks, tiles, _ = in_blocks(lists, BLOCK_SIZE, width, height, packed.dtype)
 
     def every_block(packed: Float[Array, "G D"], gaussians: Int[Array, " M"], *blocks: Any) -> Sums:
         add = partial(add_moments, chunking=CHUNKING, add_rows=_add_rows)
@@ -57,10 +57,10 @@ def gradient(
 
 
 def _add_rows(sums: Sums, ids: Int[Array, "K B"], listed: Bool[Array, "K B"], rows: Float[Array, "K B D"]) -> Sums:
-    del listed  # rows beyond a list's end are zero: to leave them out takes longer than to add them
+    del listed  # rows beyond a list's end are zero, and adding them is faster than leaving them out
     return loops.add_rows(sums, ids, rows)
 
 
 def _suits(packed: Float[Array, "G D"], lists: TileLists) -> bool:
-    """Whether a native call can do it: that wants loops of several steps, and indices that are not all the same."""
-    return lists.starts.shape[0] > BLOCK and len(packed) > 1
+    """Whether a native call can be used: it needs loops of several steps, and indices that are not all the same."""
+    return lists.starts.shape[0] > BLOCK_SIZE and len(packed) > 1

@@ -13,24 +13,24 @@ Kernel = Float[Array, "K K I O"]
 def convolve(x: Image, kernel: Kernel) -> Float[Array, "B H W O"]:
     """Convolution with zero padding that keeps the size. Gradients flow to both arguments.
 
-    Those of large images between 1, 2, 4, 8 or 16 channels in reverse mode only.
+    For large images with 1, 2, 4, 8 or 16 input and output channels they are in reverse mode only.
 
     Args:
         x: images.
         kernel: weights, of odd size.
     """
-    return _few(x, kernel) if cpu.suits(x.shape, kernel.shape) else reference.convolve(x, kernel)
+    return _with_few_channels(x, kernel) if cpu.suits(x.shape, kernel.shape) else reference.convolve(x, kernel)
 
 
 @jax.custom_vjp
-def _few(x: Image, kernel: Kernel) -> Float[Array, "B H W O"]:
+def _with_few_channels(x: Image, kernel: Kernel) -> Float[Array, "B H W O"]:
     like = jax.ShapeDtypeStruct((*x.shape[:3], kernel.shape[3]), x.dtype)
     forms = functions_by_form("convolve", reference=reference, cpu=cpu, accelerator=accelerator)
     return by_form(x, kernel, **forms, like=like)
 
 
 def _forward(x: Image, kernel: Kernel) -> tuple[Float[Array, "B H W O"], tuple[Image, Kernel]]:
-    return _few(x, kernel), (x, kernel)
+    return _with_few_channels(x, kernel), (x, kernel)
 
 
 def _backward(inputs: tuple[Image, Kernel], cotangent: Float[Array, "B H W O"]) -> tuple[Image, Kernel]:
@@ -38,4 +38,4 @@ def _backward(inputs: tuple[Image, Kernel], cotangent: Float[Array, "B H W O"]) 
     return by_form(*inputs, cotangent, **forms, like=inputs)
 
 
-_few.defvjp(_forward, _backward)
+_with_few_channels.defvjp(_forward, _backward)

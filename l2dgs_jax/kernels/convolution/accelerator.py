@@ -1,4 +1,4 @@
-"""XLA's convolution, which vendors' libraries carry out."""
+"""XLA's convolution, which calls the vendor's library."""
 
 from l2dgs_jax.kernels.convolution.reference import convolve, gradient
 

@@ -1,9 +1,9 @@
 """Convolution between few channels as loops.
 
 XLA's convolution on CPU is made for many channels. For a handful it runs at a fraction of the processor's speed, and
-the gradient in its kernel at a fraction of that, on one thread; loops that keep the vector units busy take over there.
-They see an image as rows of pixels times channels, in which a row of a pixel's window is one run of values, and handle
-as many rows of pixels together as it takes for `LANES` values of one column of the output to lie side by side.
+the gradient with respect to its kernel at a fraction of that, on one thread. There, loops that keep the vector units
+busy take over. They treat a row of the image as one array of pixels times channels, in which a row of a pixel's window
+is contiguous, and handle several rows together: as many as one column of the output needs to have `LANES` values.
 """
 
 import functools
@@ -16,9 +16,9 @@ from l2dgs_jax.kernels.compilation import native_call
 from l2dgs_jax.kernels.convolution import reference
 from l2dgs_jax.kernels.loops import Index, loop
 
-LANES = 16  # values that a step of the loops computes side by side: a few vector registers
-TERMS = 8  # products added to each of them between two visits to memory
-FEW = 4  # channels on either side, up to which a loop outruns XLA's convolution even where that has several threads
+LANES = 16  # values that a step of the loops computes together: a few vector registers
+TERMS = 8  # products that are added to each of them between two memory accesses
+LOOP_CHANNELS = 4  # input or output channels up to which a loop is faster than XLA's convolution on several threads
 
 Image = Float[Array, "B H W I"]
 Kernel = Float[Array, "K K I O"]
@@ -32,12 +32,12 @@ def suits(image: tuple[int, ...], kernel: tuple[int, ...]) -> bool:
 
 
 def convolve(x: Image, kernel: Kernel) -> Float[Array, "B H W O"]:
-    """See the contract; shapes that `suits`."""
-    return (_convolve_by_loops if min(kernel.shape[2:]) <= FEW else reference.convolve)(x, kernel)
+    """See the contract in `__init__`; only for shapes for which `suits` is true."""
+    return (_convolve_by_loops if min(kernel.shape[2:]) <= LOOP_CHANNELS else reference.convolve)(x, kernel)
 
 
 def gradient(x: Image, kernel: Kernel, cotangent: Float[Array, "B H W O"]) -> tuple[Image, Kernel]:
-    """The gradients of `convolve` in both arguments."""
+    """The gradients of `convolve` with respect to both arguments."""
     turned = jnp.flip(kernel, (0, 1)).swapaxes(2, 3)
     return convolve(cotangent, turned), _kernel_gradient_by_loops(x, cotangent, len(kernel))
 
@@ -49,14 +49,15 @@ def _convolve_by_loops(x: Image, kernel: Kernel) -> Float[Array, "B H W O"]:
     blocks = -(-height // together)
     terms = max(n for n in range(1, TERMS + 1) if window % n == 0)
     parts = window // terms
-    # For each row of the image that rows of pixels need together, the weights of all of them, zero where one does not.
+    # For each row of the image that the rows handled together need: its weight for all of them, zero for those that do
+    # not need it.
     by_row = kernel.reshape(size, window, outputs)
     shifted = [jnp.pad(by_row, ((row, together - 1 - row), (0, 0), (0, 0))) for row in range(together)]
     weights = jnp.stack(shifted, axis=2).reshape(-1, terms, LANES)
 
     def convolved(x: Float[Array, "B R P"], weights: Float[Array, "S T L"]) -> Float[Array, "B H W O"]:
         def each_rows(n: Index, out: Float[Array, "B H W O"]) -> Float[Array, "B H W O"]:
-            # The last rows of pixels overlap those before them if they do not come out even.
+            # If the height is not a multiple of `together`, the last rows overlap those before them.
             image, top = n // blocks, jnp.minimum(n % blocks * together, height - together)
 
             def add_terms(n: Index, sums: Float[Array, "W L"]) -> Float[Array, "W L"]:
@@ -103,7 +104,7 @@ def _kernel_gradient_by_loops(x: Image, cotangent: Float[Array, "B H W O"], size
 
                 return tuple(with_terms(row, in_row) for row, in_row in enumerate(sums))
 
-            # A sum of sums: added to the total one by one, small values would lose their last digits.
+            # A sum of sums: small values added to the total one by one would lose their last digits.
             return jax.tree.map(jnp.add, total, loop(runs, each_run, jax.tree.map(jnp.zeros_like, total)))
 
         return loop(batch * blocks, each_rows, (jnp.zeros((window, LANES), x.dtype),) * needed)
@@ -115,14 +116,14 @@ def _kernel_gradient_by_loops(x: Image, cotangent: Float[Array, "B H W O"], size
 
 
 def _rows(x: Float[Array, "B H W I"], size: int, below: int = 0, right: int = 0) -> Float[Array, "B R P"]:
-    """Rows of pixels times channels, padded for a kernel of `size`, and further on two sides."""
+    """Rows of pixels times channels, padded for a kernel of `size`, and further below and to the right."""
     reach = size // 2
     padded = jnp.pad(x, ((0, 0), (reach, reach + below), (reach, reach + right), (0, 0)))
     return padded.reshape(*padded.shape[:2], -1)
 
 
 def _start(*start: Index | int) -> tuple[Index, ...]:
-    # Counters stay 32 bits wide where other integers are 64, and all indices of a slice must be of one kind.
+    # Loop counters have 32 bits even where other integers have 64, and all indices of a slice must have the same type.
     return tuple(jnp.asarray(index, jnp.int32) for index in start)
 
 

@@ -1,8 +1,8 @@
 """Interpolation in the six planes of a HexPlane (arXiv 2301.09632; Eq. 1), all scales and all instants at once.
 
-A query fixes the time of all its points, so each space-time plane has collapsed to a line before, and only lookups in
-planes of space and in lines are left. Planes are stored channels last and read through flat row indices: one contiguous
-row a corner. All scales are looked up at once, as the rows of one table.
+A query fixes the time of all its points, so each space-time plane has been reduced to a line before, and only lookups
+in spatial planes and in lines are left. Planes are stored channels last and read through flat row indices: each corner
+of a cell is one contiguous row. All scales are looked up at once, as rows of one table.
 """
 
 from collections.abc import Callable
@@ -32,10 +32,10 @@ def lookup(
     Gradients flow to `space`, `lines` and `weight`, in reverse mode only.
 
     Args:
-        space: planes of space as rows: scale by scale XY, YZ, ZX; the axis named first is the slower one.
-        lines: lines Z, X, Y as rows: scale by scale, each for every view.
-        cell: x, y and z of the cell that a row of the result lies in.
-        weight: how far into it, in [0, 1].
+        space: rows of the spatial planes: for each scale XY, YZ, ZX; the axis named first varies slower.
+        lines: rows of the lines: for each scale Z, X, Y, each of these for every view.
+        cell: x, y and z indices of the cell that each row of the result lies in.
+        weight: relative position within the cell along x, y and z, in [0, 1].
         layout: what is fixed at compilation.
     """
     count, channels = len(cell[0]), space.shape[1]
@@ -48,7 +48,7 @@ def lookup(
 
 
 def _forms(name: str, layout: Layout, count: int) -> dict[str, Callable[..., Any]]:
-    # A loop of one step would be unrolled, and native calls want loops.
+    # A loop of one step would be unrolled, but native calls need loops.
     cpu_form = cpu if count > 1 else accelerator
     return functions_by_form(name, reference=reference, cpu=cpu_form, accelerator=accelerator, layout=layout)
 

@@ -21,7 +21,7 @@ from l2dgs_jax.kernels.hexplane_lookup.layout import (
 def lookup(
     space: Float[Array, "R C"], lines: Float[Array, "L C"], cell: Cells, weight: Weights, *, layout: Layout
 ) -> Float[Array, "V M C"]:
-    """See the contract."""
+    """See the contract in `__init__`."""
 
     def gather(table: Float[Array, "N C"], rows: list) -> list:
         ids, structure = jax.tree.flatten(rows)
@@ -44,5 +44,5 @@ def gradient(
     *,
     layout: Layout,
 ) -> tuple[Float[Array, "R C"], Float[Array, "L C"], Weights]:
-    """The gradients of `lookup` in `space`, `lines` and `weight`."""
+    """The gradients of `lookup` with respect to `space`, `lines` and `weight`."""
     return gradient_of(partial(lookup, layout=layout), space, lines, cell, weight, cotangent)

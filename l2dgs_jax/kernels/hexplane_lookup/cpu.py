@@ -1,4 +1,4 @@
-"""A loop over the rows, whose values never leave the first cache."""
+"""A loop over the rows of the result, whose values stay in the L1 cache."""
 
 from collections.abc import Callable
 from functools import partial
@@ -24,7 +24,7 @@ from l2dgs_jax.kernels.loops import Index, add_row, loop, read, read_row, write_
 def lookup(
     space: Float[Array, "R C"], lines: Float[Array, "L C"], cell: Cells, weight: Weights, *, layout: Layout
 ) -> Float[Array, "V M C"]:
-    """See the contract; at least two rows."""
+    """See the contract in `__init__`; at least two rows."""
     count, channels = len(cell[0]), space.shape[1]
 
     def look_up(*inputs: Any) -> Float[Array, "VM C"]:
@@ -48,7 +48,7 @@ def gradient(
     *,
     layout: Layout,
 ) -> tuple[Float[Array, "R C"], Float[Array, "L C"], Weights]:
-    """The gradients of `lookup` in `space`, `lines` and `weight`."""
+    """The gradients of `lookup` with respect to `space`, `lines` and `weight`."""
     count, channels = len(cell[0]), space.shape[1]
 
     def pull_back(cotangent: Float[Array, "VM C"], *inputs: Any) -> tuple[Float[Array, "..."], ...]:
@@ -70,13 +70,13 @@ def gradient(
     in_space, in_lines, per_channel = native_call(pull_back)(
         cotangent.reshape(-1, channels), space, lines, cell, weight
     )
-    # A matrix product, because sums over a few channels are slow on CPU.
+    # A matrix product instead of a sum, because sums over a few channels are slow on CPU.
     in_weights = jnp.matmul(per_channel, jnp.ones((channels, 1), space.dtype), precision="highest").reshape(3, count)
     return in_space, in_lines, tuple(in_weights)
 
 
 def _inputs_of_row(views: int, scale: ScaleTables, inputs: Any, row: Index) -> tuple[Any, Any]:
-    """The rows of the tables that a row of the result reads, and the arguments of `interpolate` for it alone."""
+    """The rows of the tables that a row of the result reads, and the arguments of `interpolate` for that row."""
     space, lines, cell, weight = inputs
     rows = rows_read(views, scale, tuple(read(x, row) for x in cell))  # type: ignore[arg-type]
     corners, ends = (
@@ -87,7 +87,7 @@ def _inputs_of_row(views: int, scale: ScaleTables, inputs: Any, row: Index) -> t
 
 
 def _each_row(layout: Layout, count: int, body: Callable[[ScaleTables, Index, Any], Any], state: Any) -> Any:
-    """A loop over the rows, scale by scale: the planes of one scale may fit a cache."""
+    """A loop over the rows, scale by scale, because the planes of one scale may fit into a cache."""
     scales = len(layout.sizes)
 
     def each_point(scale: Index, state: Any) -> Any:

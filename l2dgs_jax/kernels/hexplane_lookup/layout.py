@@ -1,4 +1,4 @@
-"""Where the rows of the tables lie, and what is interpolated from them."""
+"""Where the rows of the lookup tables lie, and how values are interpolated from them."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -16,15 +16,15 @@ Cells = tuple[Int[Array, "*M"], Int[Array, "*M"], Int[Array, "*M"]]
 Weights = tuple[Float[Array, "*M"], Float[Array, "*M"], Float[Array, "*M"]]
 Rows = list[Float[Array, "M C"]]
 ScaleTables = tuple[Int[Array, "*M"], Int[Array, "*M"], Int[Array, "*M"]]
-Corners = list[list[Int[Array, "*M"]]]  # of the planes
-Ends = list[list[list[Int[Array, "*M"]]]]  # of the lines, for each view
+Corners = list[list[Int[Array, "*M"]]]  # rows of the corners of cells, for each plane
+Ends = list[list[list[Int[Array, "*M"]]]]  # rows of the ends of cells, for each view and line
 
 
 class Layout(NamedTuple):
     """What is fixed at compilation.
 
     Attributes:
-        sizes: cells of a spatial axis at each scale.
+        sizes: number of cells along a spatial axis, at each scale.
         views: number of instants.
         aggregation: "paired_sum" (Eq. 1) or "product" of all six features.
     """
@@ -40,7 +40,7 @@ def lerp(start: Float[Array, "*S"], end: Float[Array, "*S"], weight: Float[Array
 
 
 def tables_of_scale(layout: Layout, scale: Int[Array, "*M"]) -> ScaleTables:
-    """Cells of a spatial axis at a scale, and its first rows in the tables of space and of lines."""
+    """For a scale: cells along a spatial axis, its first row in the table of planes, and in that of lines."""
 
     def at_scale(values: Int[np.ndarray, " S"]) -> Int[Array, "..."]:
         return jnp.asarray(values, jnp.int32).at[scale].get(mode="promise_in_bounds", wrap_negative_indices=False)
@@ -53,7 +53,7 @@ def tables_of_scale(layout: Layout, scale: Int[Array, "*M"]) -> ScaleTables:
 
 
 def rows_read(views: int, tables: ScaleTables, cell: Cells) -> tuple[Corners, Ends]:
-    """Rows of the tables that a row of the lookup reads: four corners of each plane, two ends of each time's lines."""
+    """Rows of the tables that one lookup reads: four corners in each plane, and two ends in each line of each view."""
     size, in_space, in_lines = tables
     corners = [
         [in_space + (plane * size + cell[a]) * size + cell[b] + offset for offset in (0, 1, size, size + 1)]
@@ -73,9 +73,9 @@ def interpolate(corners: list[Rows], ends: list[list[Rows]], weights: Rows, aggr
     """For each view, the argument of g in Eq. 1, or the product of all six features; gradients flow to all arrays.
 
     Args:
-        corners: of each plane of space, the values [M C] at the four corners of the cells.
-        ends: for each view and line, the values at the two ends of the cells.
-        weights: how far into the cell, along x, y and z.
+        corners: for each spatial plane, the values [M C] at the four corners of the cells.
+        ends: for each view and line, the values [M C] at the two ends of the cells.
+        weights: relative position within the cell, along x, y and z.
         aggregation: see `Layout`.
     """
     space = [
@@ -98,6 +98,6 @@ def gradient_of(
     weight: Weights,
     cotangent: Float[Array, "V M C"],
 ) -> tuple[Float[Array, "R C"], Float[Array, "L C"], Weights]:
-    """The gradients of a lookup in `space`, `lines` and `weight`, as JAX derives them."""
+    """The gradients of a lookup with respect to `space`, `lines` and `weight`, as JAX derives them."""
     _, pull = jax.vjp(lambda space, lines, weight: lookup(space, lines, cell, weight), space, lines, weight)
     return pull(cotangent)

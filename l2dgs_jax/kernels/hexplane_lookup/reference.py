@@ -11,7 +11,7 @@ from l2dgs_jax.kernels.hexplane_lookup.layout import SPACE_AXES, TIME_AXES, Cell
 def lookup(
     space: Float[Array, "R C"], lines: Float[Array, "L C"], cell: Cells, weight: Weights, *, layout: Layout
 ) -> Float[Array, "V M C"]:
-    """See the contract."""
+    """See the contract in `__init__`."""
     scales, channels = len(layout.sizes), space.shape[1]
     found = []
     for scale, size in enumerate(layout.sizes):
@@ -33,7 +33,7 @@ def gradient(
     *,
     layout: Layout,
 ) -> tuple[Float[Array, "R C"], Float[Array, "L C"], Weights]:
-    """The gradients of `lookup` in `space`, `lines` and `weight`."""
+    """The gradients of `lookup` with respect to `space`, `lines` and `weight`."""
     return gradient_of(partial(lookup, layout=layout), space, lines, cell, weight, cotangent)
 
 
@@ -44,7 +44,7 @@ def _features(
     cell: list[Int[Array, " P"]],
     weight: list[Float[Array, "P 1"]],
 ) -> Float[Array, "V P C"]:
-    """Of one scale."""
+    """The result of `lookup` for one scale."""
     terms = []
     for plane, (a, b), line, axis in zip(planes, SPACE_AXES, lines, TIME_AXES, strict=True):
         i, j, k = cell[a], cell[b], cell[axis]

@@ -1,4 +1,4 @@
-"""Sorts by counting, as loops: XLA's comparison sort is slow on CPU."""
+"""Counting and radix sorts as loops: XLA's comparison sort is slow on CPU."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
@@ -7,16 +7,16 @@ from l2dgs_jax.kernels.compilation import native_call, unfused
 from l2dgs_jax.kernels.loops import Index, loop, read, write
 from l2dgs_jax.kernels.sort.keys import ordered_integers
 
-DIGIT = 11  # bits that a pass of the radix sort looks at
-BUCKETS = 2**DIGIT
+DIGIT_BITS = 11  # bits that a pass of the radix sort sorts by
+BUCKETS = 2**DIGIT_BITS
 
 
 def argsort(values: Float[Array, " N"]) -> Int[Array, " N"]:
-    """See the contract; at least two values."""
+    """See the contract in `__init__`; at least two values."""
     keys = ordered_integers(values)
     integer = keys.dtype.type
     order = jnp.arange(values.shape[0], dtype=jnp.int32)
-    for shift in range(0, jnp.iinfo(keys.dtype).bits, DIGIT):
+    for shift in range(0, jnp.iinfo(keys.dtype).bits, DIGIT_BITS):
         digits = ((keys[order] >> integer(shift)) & integer(BUCKETS - 1)).astype(jnp.int32)
         order = order[_counting_sort(digits, BUCKETS)[0]]
     return order
@@ -25,8 +25,8 @@ def argsort(values: Float[Array, " N"]) -> Int[Array, " N"]:
 def sort_pairs(
     tiles: Int[Array, " M"], ranks: Int[Array, " M"], *, tile_count: int, rank_count: int
 ) -> tuple[Int[Array, " M"], Int[Array, " M"], Int[Array, " T1"]]:
-    """See the contract."""
-    del rank_count  # those of a tile are in order already, and the sort is stable
+    """See the contract in `__init__`."""
+    del rank_count  # not needed: the ranks of a tile are in order already, and the sort is stable
     order, starts = _counting_sort(tiles, tile_count + 1)
     return tiles[order], ranks[order], starts[:-1]
 
@@ -49,7 +49,7 @@ def _count_and_distribute(keys: Int[Array, " M"], buckets: int) -> tuple[Int[Arr
     ) -> tuple[Int[Array, " B"], Int[Array, " M"]]:
         following, order = state
         bucket = read(keys, i)
-        # Read on its own: fused with both writes, it would make XLA copy the array that it reads from.
+        # Not fused: if this read were fused with both writes, XLA would copy the array that it reads from.
         position = unfused(read)(following, bucket)
         return write(following, bucket, position + 1), write(order, position, i)
 

@@ -1,4 +1,4 @@
-"""A loop over the Gaussians; pairs that touch take the first places."""
+"""A loop over the Gaussians and the tiles of their boxes; pairs that touch are stored one after the other."""
 
 from functools import partial
 
@@ -8,15 +8,15 @@ from jaxtyping import Array, Float, Int
 from l2dgs_jax.kernels.compilation import native_call
 from l2dgs_jax.kernels.loops import Index, loop, read, write
 from l2dgs_jax.kernels.tile_lists.ellipse import reaches_tile
-from l2dgs_jax.kernels.tiles import TILE, Tiling
+from l2dgs_jax.kernels.tiles import TILE_SIZE, Tiling
 
-Listed = tuple[Index, Int[Array, " M1"], Int[Array, " M1"]]  # number of pairs so far, their tiles, their rows
+Listed = tuple[Index, Int[Array, " M1"], Int[Array, " M1"]]  # number of pairs so far, their tiles, their Gaussians
 
 
 def list_pairs(
     box: Int[Array, "G 4"], ellipse: Float[Array, "G 6"], tiling: Tiling
 ) -> tuple[Int[Array, " M"], Int[Array, " M"]]:
-    """See the contract; at least two Gaussians."""
+    """See the contract in `__init__`; at least two Gaussians."""
     views, columns, rows, capacity = tiling
     count = box.shape[0] // views
     nowhere = views * columns * rows
@@ -31,8 +31,8 @@ def list_pairs(
 
             def list_tile(row: Index, column: Index, state: Listed) -> Listed:
                 end, tiles, slots = state
-                x, y = (TILE * index.astype(own[0].dtype) + 0.5 for index in (column, row))
-                # What does not touch is overwritten by the next pair that does; the place after the last is spare.
+                x, y = (TILE_SIZE * index.astype(own[0].dtype) + 0.5 for index in (column, row))
+                # A pair that does not touch is overwritten by the next one; the last place of the arrays is spare.
                 tiles = write(tiles, end, first + row * columns + column)
                 slots = write(slots, end, slot)
                 return jnp.minimum(end + reaches_tile(own, x, y).astype(jnp.int32), capacity), tiles, slots

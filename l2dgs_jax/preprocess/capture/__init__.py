@@ -1,4 +1,4 @@
-"""From a video or a folder of frames to frames with poses."""
+"""From a video or a folder of frames to a scene with camera poses."""
 
 from l2dgs_jax.preprocess.capture.pipeline import CaptureConfig, prepare
 

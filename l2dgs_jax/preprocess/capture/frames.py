@@ -1,4 +1,4 @@
-"""Frames out of a video or a folder: how sharp each one is, which to take, and writing those untouched."""
+"""Frames of a video or a folder: measuring their sharpness, selecting some, and writing these unchanged."""
 
 import contextlib
 import math
@@ -17,16 +17,16 @@ from l2dgs_jax.data import images
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.runtime.files import replacing
 
-SCORED_SIZE = 480  # longer side of the picture whose sharpness is measured, pixels
+SCORED_SIZE = 480  # longer side at which sharpness is measured, pixels
 
 
 class Candidate(NamedTuple):
-    """A frame that could be taken.
+    """A frame that could be selected.
 
     Attributes:
-        number: its instant, milliseconds into a video or the number in a picture's name; unique and increasing.
-        origin: where it is from: the picture's name, or a position in the video.
-        sharpness: comparable between frames that show about the same.
+        number: its time: milliseconds into a video, or the number in a picture's name; unique and increasing.
+        origin: where it is from: the picture's name, or its position in the video.
+        sharpness: comparable only between frames that show about the same.
     """
 
     number: int
@@ -35,12 +35,12 @@ class Candidate(NamedTuple):
 
     @property
     def name(self) -> str:
-        """What its picture is called: the number alone, so that a reader can tell its instant."""
+        """Name of its picture: the number alone, so that readers of the scene can derive its instant."""
         return f"{self.number:06d}.png"
 
 
 def scan(source: Path) -> list[Candidate]:
-    """Look at every frame of a video, or at every picture of a folder in the order of the numbers in their names.
+    """All frames of a video, or all pictures of a folder in the order of the numbers in their names.
 
     Raises:
         UserError: there is nothing to read, a picture is damaged, or pictures differ in size.
@@ -53,15 +53,15 @@ def scan(source: Path) -> list[Candidate]:
             times.append(round(milliseconds))
             scores.append(sharpness(frame[..., ::-1].astype(np.float32) / 255))
             bar.update()
-    # Containers without time stamps say nothing or always the same: the frames are then counted.
+    # If the container has no time stamps, so that times do not increase, frames are numbered instead.
     numbers = times if np.all(np.diff(times) > 0) else range(len(times))
     return [Candidate(n, f"frame {i}", score) for i, (n, score) in enumerate(zip(numbers, scores, strict=True))]
 
 
 def sample(scores: Sequence[float], count: int) -> list[int]:
-    """Indices of at most `count` frames, evenly spaced as far as taking the sharpest of near neighbours allows.
+    """Indices of at most `count` sharp frames that are about evenly spaced.
 
-    Time is divided into `count` equal parts; each gives its sharpest frame out of its middle half.
+    The clip is divided into `count` equal parts; from the middle half of each, the sharpest frame is taken.
     """
     total = len(scores)
     if total <= count:
@@ -77,9 +77,9 @@ def sample(scores: Sequence[float], count: int) -> list[int]:
 
 
 def extract(source: Path, candidates: Sequence[Candidate], chosen: Sequence[int], folder: Path) -> None:
-    """Write the chosen frames to `folder`, which may hold some of them already from an earlier call.
+    """Write the chosen frames to `folder`, which may already hold some of them from an earlier call.
 
-    PNG files are copied byte by byte; video frames and other pictures become upright PNG of the same pixel values.
+    PNG files are copied byte by byte; video frames and other pictures become upright PNG with the same pixel values.
 
     Raises:
         UserError: a frame cannot be read or written.
@@ -104,7 +104,7 @@ def extract(source: Path, candidates: Sequence[Candidate], chosen: Sequence[int]
 def sharpness(image: Float32[np.ndarray, "H W 3"]) -> float:
     """Mean squared Laplacian relative to the squared mean brightness, so that exposure does not matter.
 
-    Measured on a small, slightly blurred copy: at full size the noise of a dark frame would pass for detail.
+    It is measured on a small, slightly blurred copy: at full size, the noise of a dark frame would look like detail.
     """
     grey = shrink(luma(image), SCORED_SIZE)
     grey = cv2.GaussianBlur(grey, (0, 0), 1.0)
@@ -112,7 +112,7 @@ def sharpness(image: Float32[np.ndarray, "H W 3"]) -> float:
 
 
 def luma(image: Float32[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "H W"]:
-    """Luma of Rec. 601 in [0, 1], as the matching of features sees it."""
+    """Luma (Rec. 601) in [0, 1], the grey value that feature matching uses."""
     return image @ np.array([0.299, 0.587, 0.114], np.float32)
 
 
@@ -141,7 +141,7 @@ def _scan_folder(folder: Path) -> list[Candidate]:
 
 
 def _numbers(stems: Sequence[str]) -> list[int]:
-    """The last number in each name that tells all names apart, or else their places in alphabetical order."""
+    """The last number in each name that differs between all names, or else the names' places in alphabetical order."""
     groups = [[int(digits) for digits in re.findall(r"[0-9]+", stem)][::-1] for stem in stems]
     for numbers in zip(*groups, strict=False):
         if len(set(numbers)) == len(stems):
@@ -172,7 +172,7 @@ def _decode(path: Path) -> Iterator[tuple[float, UInt8[np.ndarray, "H W 3"]]]:
 
 
 class _Capture:
-    """OpenCV's reader of a video, to be closed."""
+    """OpenCV's video reader with a `close` method."""
 
     def __init__(self, path: Path) -> None:
         self.video: Any = cv2.VideoCapture(str(path))

@@ -20,7 +20,7 @@ from l2dgs_jax.preprocess.capture.structure import CameraModel, Workplace
 from l2dgs_jax.runtime.files import expect_new, new_folder, replacing, write_json
 
 FEWEST_FRAMES = 5
-FEWEST_REGISTERED = 0.5  # part of the frames
+FEWEST_REGISTERED = 0.5  # share of the frames that must get a pose
 ADVICE = (
     "film more slowly, with more light and more overlap, and walk instead of turning on the spot; "
     "or try more --frames, or another --camera-model"
@@ -32,9 +32,9 @@ class CaptureConfig:
     """How a video becomes a scene.
 
     Attributes:
-        frames: how many to take at most, evenly spaced and sharp.
-        camera_model: COLMAP's name of the lens that all frames share.
-        threads: processor threads for structure from motion; 0 for all. Only 1 gives the same numbers every time.
+        frames: largest number of frames to take, evenly spaced and sharp.
+        camera_model: COLMAP's name of the camera model that all frames share.
+        threads: CPU threads for structure from motion; 0 for all. Only with 1 are results reproducible.
     """
 
     frames: int = 120
@@ -48,22 +48,22 @@ Curve = Callable[[Float32[np.ndarray, "H W 3"], brighten.Tone], UInt8[np.ndarray
 def prepare(source: Path, output: Path, cfg: CaptureConfig, curve: Curve = brighten.brighten) -> dict:
     """Make the scene: frames, COLMAP's model, `report.json` and `contact_sheet.png`.
 
-    What is done is kept in a folder beside `output`, its name ending in `.partial`, where the next call with the same
-    source and settings goes on; it is removed once the scene is whole.
+    Intermediate results are kept in a folder beside `output` whose name ends in `.partial`. The next call with the same
+    source and settings continues from there; the folder is removed once the scene is complete.
 
     Args:
-        source: a video, or a folder of frames whose names count them.
-        output: folder to make.
-        cfg: how.
-        curve: makes the brighter copies that features and flow are found in. Kept work does not know of which curve it
-            is: another one wants another `output`.
+        source: a video, or a folder of frames with numbered names.
+        output: folder to create.
+        cfg: settings.
+        curve: makes the brighter copies that features and flow are found in. Intermediate results do not record which
+            curve they were made with, so another curve needs another `output`.
 
     Returns:
         The report.
 
     Raises:
-        UserError: a setting or `output` is not as expected, the source cannot be read, the camera does not move, or too
-            few frames find a pose; the folder of the work then holds a contact sheet that shows why.
+        UserError: a setting or `output` is invalid, the source cannot be read, the camera does not move, or too few
+            frames get a pose; in the last case the `.partial` folder holds a contact sheet that shows why.
     """
     if cfg.frames < FEWEST_FRAMES:
         raise UserError(f"--frames {cfg.frames}: expected at least {FEWEST_FRAMES}")
@@ -91,7 +91,7 @@ def prepare(source: Path, output: Path, cfg: CaptureConfig, curve: Curve = brigh
     names = [candidates[i].name for i in chosen]
     tone, copies = _brighten(workplace, names, curve)
     shift = motion.camera_shift(copies)
-    if shift < motion.STILL:
+    if shift < motion.STILL_BELOW:
         raise UserError(
             f"{source}: the camera stands still (the picture shifts by {shift:.1f} of {copies[0].shape[1]} "
             "pixels); expected a camera that moves through the scene, as depth shows in parallax only"
@@ -100,7 +100,7 @@ def prepare(source: Path, output: Path, cfg: CaptureConfig, curve: Curve = brigh
     structure.find_features(workplace, names, cfg.camera_model)
     structure.match_features(workplace, names)
     pairs, with_parallax = structure.count_pairs(workplace)
-    if pairs and not with_parallax:  # a scene of little depth has few, and its poses are found all the same
+    if pairs and not with_parallax:  # only if there are none: scenes of little depth have few, which suffice
         raise UserError(
             f"{source}: 0 of {pairs} pairs of frames show parallax, so the camera only turns or "
             f"sees a flat surface; expected a camera that moves through the scene: {ADVICE}"
@@ -137,7 +137,7 @@ def prepare(source: Path, output: Path, cfg: CaptureConfig, curve: Curve = brigh
 
 
 def _open_work(source: Path, output: Path, cfg: CaptureConfig) -> Path:
-    """The folder of intermediate results; those of other settings or of another source are cleared away."""
+    """The folder of intermediate results; results of other settings or another source are deleted."""
     work = output.absolute().with_name(f"{output.absolute().name}.partial")
     inside = source.iterdir() if source.is_dir() else ()
     settings = json.dumps(
@@ -152,7 +152,7 @@ def _open_work(source: Path, output: Path, cfg: CaptureConfig) -> Path:
     record = work / "settings.json"
     if work.exists():
         if not record.is_file() and any(work.iterdir()):
-            raise UserError(f"{work}: is not what prepare left there; expected a free name for its work")
+            raise UserError(f"{work}: exists, but prepare has not written it; expected a free name for its work")
         if record.is_file() and record.read_text() == settings:
             print(f"going on in {work}")
             return work
@@ -175,7 +175,7 @@ def _scan(source: Path, work: Path) -> list[Candidate]:
 def _brighten(
     workplace: Workplace, names: Sequence[str], curve: Curve
 ) -> tuple[brighten.Tone, list[UInt8[np.ndarray, "h w"]]]:
-    """Write the copies that features are found in; returns them at the size that flow is computed on."""
+    """Write the copies in which features are found; returns them at the size at which flow is computed."""
     tone = brighten.tone_for(images.read_image(workplace.frames / name) for name in names)
     copies = []
     for name in tqdm(names, desc="brightening", unit="frame", dynamic_ncols=True):
@@ -189,7 +189,7 @@ def _brighten(
 def _mask(
     workplace: Workplace, names: Sequence[str], copies: Sequence[UInt8[np.ndarray, "h w"]]
 ) -> list[Bool[np.ndarray, "h w"]]:
-    """Write COLMAP's masks, 0 where something moves; returns where, at the size of `copies`."""
+    """Write COLMAP's masks, 0 where something moves; returns the moving regions at the size of `copies`."""
     record = workplace.masks.with_name("moving.npz")
     if record.exists():
         return list(np.load(record)["moving"])

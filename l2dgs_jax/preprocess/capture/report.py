@@ -1,4 +1,4 @@
-"""What a structure from motion found, as numbers, as text, and as one picture."""
+"""The result of structure from motion as numbers, as text, and as a contact sheet."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -12,8 +12,8 @@ from l2dgs_jax.preprocess.capture import structure
 from l2dgs_jax.preprocess.capture.structure import Workplace
 from l2dgs_jax.visualize.sheet import GAP, cell, text_strip
 
-FEW_FEATURES = 100
-FEW_MATCHES = 30  # under which COLMAP attempts no pose
+FEW_FEATURES = 100  # below which a frame is taken to lack features
+FEW_MATCHES = 30  # below which COLMAP does not attempt to find a pose
 COLUMNS = 6  # of the contact sheet
 MOST_CELLS = 36
 
@@ -21,7 +21,7 @@ _GREEN, _RED = (80, 255, 80), (255, 70, 70)
 
 
 def measure(model: Any) -> dict:
-    """The figures of a model, as JSON can hold them; lengths in the model's own unit, which is arbitrary."""
+    """Statistics of a reconstruction that can be written as JSON."""
     camera = next(iter(model.cameras.values()))
     views = [model.image(i) for i in model.reg_image_ids()]
     centres = np.stack([view.projection_center() for view in views])
@@ -44,7 +44,7 @@ def measure(model: Any) -> dict:
 
 
 def reasons(workplace: Workplace, names: Sequence[str], model: Any | None) -> dict[str, str]:
-    """Why each frame that has no pose has none."""
+    """The likely reason for each frame without a pose, by name."""
     colmap = structure.pycolmap()
     registered = set() if model is None else set(model.reg_image_ids())
     with colmap.Database.open(workplace.database) as database:
@@ -92,15 +92,15 @@ def contact_sheet(
     model: Any | None,
     unregistered: Mapping[str, str],
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """The frames as features were sought in them: moving regions red, points of the model green.
+    """The brightened frames, with moving regions in red and points of the reconstruction in green.
 
     Args:
         names: of the frames.
         copies: their brightened copies, of any common size.
         moving: where something moves.
-        size: full width and height of the frames, in which the model counts pixels.
+        size: full width and height of the frames, to which pixels in the reconstruction refer.
         model: the reconstruction, if there is one.
-        unregistered: the frames without a pose, and why; all are shown, of the others as many as there is room for.
+        unregistered: reasons why frames have no pose, by name; these frames are all shown, of the others only some.
     """
     points = {} if model is None else {v.name: _observed(v) for v in map(model.image, model.reg_image_ids())}
     spread = np.linspace(0, len(names) - 1, min(len(names), MOST_CELLS)).round().astype(int).tolist()
@@ -124,12 +124,12 @@ def contact_sheet(
 
 
 def _observed(view: Any) -> Float[np.ndarray, "P 2"]:
-    """Pixels of the points that a view sees."""
+    """Pixels at which a view observes points."""
     return np.array([point.xy for point in view.get_observation_points2D()]).reshape(-1, 2)
 
 
 def _depths(model: Any, view: Any) -> Float[np.ndarray, " P"]:
-    """Depths in a view of the points that it sees."""
+    """Depths in a view of the points that it observes."""
     ids = [point.point3D_id for point in view.get_observation_points2D()]
     points = np.array([model.point3D(i).xyz for i in ids]).reshape(-1, 3)
     pose = view.cam_from_world().matrix()

@@ -1,6 +1,6 @@
 """Structure from motion with COLMAP (Schönberger and Frahm, CVPR 2016), through pycolmap.
 
-Everything lands in one database, step by step, so that each step goes on where an earlier call was stopped.
+Every step stores its results in one database, so that it continues where an earlier call was stopped.
 """
 
 from collections.abc import Iterator, Sequence
@@ -14,23 +14,23 @@ from l2dgs_jax.runtime.extras import extra
 
 CameraModel = Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"]
 
-LARGEST_SIDE = 1600  # pixels that features are found in
-OVERLAP = 10  # neighbours in time that each frame is matched with, and further ones at 2, 4, 8 ... times that
+LARGEST_SIDE = 1600  # of the pictures that features are found in, pixels
+OVERLAP = 10  # each frame is matched with so many next ones, and with those 2, 4, 8 ... times as far away
 SMALLEST_MODEL = 3  # frames
 FEWEST_POINTS = 50  # in a model
-ENOUGH = 0.9  # part of the frames with which the first attempt is taken
+ENOUGH_FRAMES = 0.9  # share of the frames with a pose at which the first attempt is accepted
 
 
 @dataclass(frozen=True)
 class Workplace:
-    """The files of a structure from motion.
+    """The files that structure from motion uses.
 
     Attributes:
-        frames: folder of the frames, which give points their colours.
-        copies: folder of the copies of the same names and size in which features are found.
-        masks: folder of pictures `<name>.png` that are 0 where no feature may lie.
-        database: COLMAP's.
-        models: folder for the models.
+        frames: folder of the frames, from which points get their colours.
+        copies: folder of brightened copies, of the same names and size, in which features are found.
+        masks: folder of pictures `<name>.png` that are 0 where features are ignored.
+        database: file of COLMAP's database.
+        models: folder for the reconstructions.
         threads: how many to use.
     """
 
@@ -43,7 +43,7 @@ class Workplace:
 
 
 def pycolmap() -> Any:
-    """The package, told to be quiet.
+    """The package pycolmap, with only errors logged.
 
     Raises:
         UserError: it is not installed.
@@ -54,7 +54,7 @@ def pycolmap() -> Any:
 
 
 def find_features(workplace: Workplace, names: Sequence[str], camera_model: CameraModel) -> None:
-    """SIFT features of every frame; all frames share one camera of the given model."""
+    """Find SIFT features in every frame; all frames share one camera of the given model."""
     colmap = pycolmap()
     extraction = colmap.FeatureExtractionOptions()
     extraction.use_gpu, extraction.num_threads, extraction.max_image_size = False, workplace.threads, LARGEST_SIDE
@@ -83,7 +83,7 @@ def find_features(workplace: Workplace, names: Sequence[str], camera_model: Came
 
 
 def match_features(workplace: Workplace, names: Sequence[str]) -> None:
-    """Match every frame with those near it in time and with some far away, and verify the matches geometrically."""
+    """Match every frame with frames near it in time and some far away, and verify the matches geometrically."""
     colmap = pycolmap()
     matching = colmap.FeatureMatchingOptions()
     matching.use_gpu, matching.num_threads = False, workplace.threads
@@ -92,7 +92,7 @@ def match_features(workplace: Workplace, names: Sequence[str]) -> None:
     pairing = colmap.ImportedPairingOptions()
     pairing.match_list_path = workplace.database.with_name("pairs.txt")
     for i in tqdm(range(len(names) - 1), desc="matching", unit="frame", dynamic_ncols=True):
-        # Pairs that are matched already are passed over.
+        # COLMAP skips pairs that are matched already.
         partners = (names[i + offset] for offset in offsets(len(names)) if i + offset < len(names))
         pairing.match_list_path.write_text("".join(f"{names[i]} {partner}\n" for partner in partners))
         colmap.match_image_pairs(
@@ -105,7 +105,7 @@ def match_features(workplace: Workplace, names: Sequence[str]) -> None:
 
 
 def offsets(count: int) -> list[int]:
-    """How far apart in a clip of `count` frames those are that are matched."""
+    """Distances between matched frames in a clip of `count` frames."""
     offsets = list(range(1, OVERLAP + 1))
     while (further := 2 * offsets[-1]) < count:
         offsets.append(further)
@@ -113,7 +113,7 @@ def offsets(count: int) -> list[int]:
 
 
 def count_pairs(workplace: Workplace) -> tuple[int, int]:
-    """How many pairs of frames were verified, and how many of them show parallax: no homography explains them."""
+    """How many pairs of frames were verified, and how many of them show parallax, so that no homography fits them."""
     kinds = pycolmap().TwoViewGeometryConfiguration
     flat = {int(kind) for kind in (kinds.PLANAR, kinds.PANORAMIC, kinds.PLANAR_OR_PANORAMIC)}
     with pycolmap().Database.open(workplace.database) as database:
@@ -122,17 +122,17 @@ def count_pairs(workplace: Workplace) -> tuple[int, int]:
 
 
 def reconstruct(workplace: Workplace, count: int) -> Any:
-    """Poses and points: the largest model, or None if there is none.
+    """Find poses and points.
 
-    First with a lens that does not distort, which is left to the last adjustment: few frames determine distortion
-    badly and take the rest with them. Where that leaves out too many of the `count` frames, with distortion from the
-    start, and the better one is taken.
+    The first attempt keeps lens distortion at zero until the final bundle adjustment, because few frames determine it
+    badly, which then harms all later ones. If too few of the `count` frames get a pose, a second attempt estimates
+    distortion from the start, and the better reconstruction is taken.
 
     Returns:
-        A `pycolmap.Reconstruction`.
+        The largest model, a `pycolmap.Reconstruction`; None if there is none.
     """
     first = _map(workplace, count, distorted=False)
-    if first is not None and first.num_reg_images() >= ENOUGH * count:
+    if first is not None and first.num_reg_images() >= ENOUGH_FRAMES * count:
         return first
     models = [model for model in (first, _map(workplace, count, distorted=True)) if model is not None]
     return max(models, key=_size, default=None)
@@ -148,7 +148,7 @@ def _map(workplace: Workplace, count: int, distorted: bool) -> Any:
     description = "poses, with distortion" if distorted else "poses"
     with tqdm(total=count, desc=description, unit="frame", dynamic_ncols=True) as bar:
 
-        def begin() -> None:  # also when an attempt is given up for another pair of frames
+        def begin() -> None:  # called again when an attempt is given up for another initial pair of frames
             bar.reset()
             bar.update(2)
 

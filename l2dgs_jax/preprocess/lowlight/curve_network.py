@@ -1,8 +1,8 @@
-"""Exposure-conditioned Zero-DCE: per-pixel darkening curves towards a wanted exposure, learned without references.
+"""Exposure-conditioned Zero-DCE: per-pixel darkening curves for a target exposure, learned without reference images.
 
-The network and its curve are those that LEDNet (arXiv 2202.03373) simulates low light with: Zero-DCE (arXiv 2001.06826)
-with its curve reversed and a second branch that sees the exposure. How its authors trained it is unpublished: the
-losses here are ours. The width is free; 256 channels are the released network.
+The network and its curve are those with which LEDNet (arXiv 2202.03373) simulates low light: Zero-DCE (arXiv
+2001.06826) with its curve reversed and a second branch that sees the exposure. How its authors trained it is not
+published; the losses here are ours. The width can be chosen; the released network has 256 channels.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -17,9 +17,9 @@ from l2dgs_jax.training import optimizer
 from l2dgs_jax.types import Conv
 
 ITERATIONS = 10  # of the curve
-# With Zero-DCE's smoothness of 200 the network learns to even out local tone as it trains, and edges get halos.
+# With Zero-DCE's smoothness weight of 200, the network learns to equalise local tone, and edges get halos.
 EXPOSURE_WEIGHT, SPATIAL_WEIGHT, SMOOTHNESS_WEIGHT = 10.0, 1.0, 1000.0
-BLOCK = 4  # pixels that the spatial loss averages over, each way
+BLOCK = 4  # side of the blocks that the spatial loss averages over, pixels
 
 Scalar = Float[Array, ""]
 Net = TypeVar("Net")
@@ -31,7 +31,7 @@ class CurveNet(NamedTuple):
 
     Attributes:
         exposure: four layers, 1 -> C -> C -> C -> C channels.
-        image: seven layers; the last three also read earlier ones of both branches, and the last gives the curves.
+        image: seven layers; the last three also read earlier outputs of both branches, and the last returns the curves.
     """
 
     exposure: tuple[Conv, ...]
@@ -42,7 +42,7 @@ def init(key: PRNGKeyArray, width: int) -> CurveNet:
     """Xavier-uniform kernels, zero biases.
 
     Args:
-        key: randomness of the kernels.
+        key: random key of the kernels.
         width: channels C of every hidden layer.
     """
     keys = iter(jax.random.split(key, 11))
@@ -63,7 +63,7 @@ def curves(
     Args:
         net: parameters.
         lightness: in [0, 1].
-        exposure: the lightness wanted around each pixel, in [0, 1].
+        exposure: target lightness around each pixel, in [0, 1].
     """
 
     def relu_conv(layer: Conv, *features: Float[Array, "B H W _"]) -> Float[Array, "B H W C"]:
@@ -93,7 +93,7 @@ def iterate(lightness: Float[Array, "*B"], curves: Float[Array, "*B R"]) -> Floa
 def loss(net: CurveNet, lightness: Float[Array, "B H W"], exposure: Float[Array, "B H W"]) -> Scalar:
     """The reference-free objective over a batch of images; gradients flow to `net`.
 
-    The exposure is wanted of each image as a whole: wanted of every block, as Zero-DCE wants it, it evens out all tone.
+    The target exposure applies to each image as a whole: applied to every block, as in Zero-DCE, it flattens all tone.
     """
     r = curves(net, lightness, exposure)
     dark = iterate(lightness, r)
@@ -105,12 +105,12 @@ def loss(net: CurveNet, lightness: Float[Array, "B H W"], exposure: Float[Array,
 
 
 def exposure_loss(dark: Float[Array, "B H W"], exposure: Float[Array, "B H W"]) -> Scalar:
-    """How far the mean of each image is from the mean exposure wanted of it. Gradients flow to both."""
+    """Mean absolute difference between the mean of each image and its mean target exposure. Gradients flow to both."""
     return jnp.abs(dark.mean((1, 2)) - exposure.mean((1, 2))).mean()
 
 
 def spatial_loss(dark: Float[Array, "B H W"], lightness: Float[Array, "B H W"]) -> Scalar:
-    """How far steps between neighbouring blocks are from those of the input scaled to the same mean.
+    """Squared error of the differences between neighbouring blocks, against the input scaled to the same mean.
 
     Gradients flow to `dark`, but not through that scale.
     """
@@ -120,19 +120,19 @@ def spatial_loss(dark: Float[Array, "B H W"], lightness: Float[Array, "B H W"]) 
 
 
 def smoothness_loss(curves: Float[Array, "B H W R"]) -> Scalar:
-    """Squared steps between neighbouring pixels, summed over the curves (Zero-DCE's total variation)."""
+    """Squared differences of neighbouring pixels, summed over the curve parameters (Zero-DCE's total variation)."""
     return curves.shape[-1] * squared_steps(curves)
 
 
 def train(
     net: Net, batches: Iterable[Batch], rate: optimizer.Schedule, objective: Callable[..., Scalar] = loss
 ) -> Iterator[tuple[Net, Scalar]]:
-    """One step of Adam for every batch; yields the network and the loss before it.
+    """One step of Adam per batch; yields the network after it and the loss before it.
 
     Args:
         net: parameters.
-        batches: what `objective` takes besides them; by default lightness and exposure maps.
-        rate: of learning.
+        batches: further arguments of `objective`; by default lightness and exposure maps.
+        rate: schedule of the learning rate.
         objective: the loss.
     """
     adam = optimizer.adam(jax.tree.map(lambda _: "net", net), {"net": rate}, 0.9, 0.999, 1e-8)
@@ -150,12 +150,12 @@ def train(
 
 
 def squared_steps(image: Float[Array, "B H W R"]) -> Scalar:
-    """Mean squared step to the neighbours, over both directions of x and of y."""
+    """Mean squared difference from the neighbours: those in x plus those in y, each counted from both sides."""
     return 2 * (jnp.square(jnp.diff(image, axis=1)).mean() + jnp.square(jnp.diff(image, axis=2)).mean())
 
 
 def block_means(image: Float[Array, "B H W"]) -> Float[Array, "B h w"]:
-    """Means of blocks of `BLOCK` x `BLOCK` pixels; those that the image cuts off are left out."""
+    """Means of blocks of `BLOCK` x `BLOCK` pixels; incomplete blocks are left out."""
     batch, height, width = image.shape
     rows, columns = height // BLOCK, width // BLOCK
     whole = image[:, : rows * BLOCK, : columns * BLOCK]

@@ -1,7 +1,7 @@
 """Low-light pictures from well-lit ones, as LEDNet's pipeline makes them (arXiv 2202.03373).
 
-A darkener turns the lightness of a picture into that of its dark twin, given the exposure that is wanted of every
-pixel; the ratio of the two lightnesses then scales all three channels, and eight bits are left by truncation.
+A darkener turns the lightness of a picture into that of its dark twin, given the target exposure of every pixel. The
+ratio of the two lightnesses then scales all three channels, and the result is truncated to 8 bits.
 """
 
 from collections.abc import Callable
@@ -16,8 +16,8 @@ from jaxtyping import Bool, Float32, UInt8
 from l2dgs_jax.data.color import linear_to_srgb, srgb_to_linear
 from l2dgs_jax.preprocess.lowlight import curve_network
 
-SATURATED = 0.97  # lightness from which a pixel shows a light source or clipped white
-HIGHLIGHT_POWER = 33  # of the analytic curve
+SATURATED = 0.97  # lightness above which a pixel is taken for a light source or clipped white
+HIGHLIGHT_POWER = 33  # exponent in the analytic curve
 
 LabOrder = Literal["correct", "lednet"]
 Image = Float32[np.ndarray, "H W 3"]
@@ -30,10 +30,10 @@ def darken(image: Image, exposure: float, darkener: Darkener, order: LabOrder, b
 
     Args:
         image: sRGB values in [0, 1].
-        exposure: mean lightness wanted of the dark twin, saturated pixels aside.
-        darkener: analytic or network.
+        exposure: target mean lightness of the dark twin, not counting saturated pixels.
+        darkener: see `analytic_darkener` and `network_darkener`.
         order: see `lightness`.
-        brighten: let pixels become brighter where the darkener says so, as LEDNet does; else no ratio exceeds 1.
+        brighten: whether pixels may become brighter if the darkener says so, as in LEDNet.
     """
     light = lightness(image, order)
     ratio = darkener(light, exposure_map(light, exposure)) / (light + 1e-10)
@@ -47,7 +47,7 @@ def lightness(image: Image, order: LabOrder = "correct") -> Plane:
 
     Args:
         image: sRGB values in [0, 1].
-        order: "lednet" takes red for blue and blue for red, as LEDNet's script does.
+        order: "lednet" swaps red and blue, as LEDNet's script does.
     """
     code = cv2.COLOR_RGB2LAB if order == "correct" else cv2.COLOR_BGR2LAB
     return np.clip(cv2.cvtColor(image, code)[..., 0] / 100, 0, 1)
@@ -59,25 +59,25 @@ def saturated(lightness: Float32[np.ndarray, "*B"]) -> Bool[np.ndarray, "*B"]:
 
 
 def exposure_map(lightness: Float32[np.ndarray, "*B"], exposure: float) -> Float32[np.ndarray, "*B"]:
-    """The lightness wanted of every pixel: `exposure`, and their own of saturated ones."""
+    """The target lightness of every pixel: `exposure`, but its own lightness where it is saturated."""
     return np.where(saturated(lightness), lightness, np.float32(exposure))
 
 
 def network_darkener(net: curve_network.CurveNet) -> Darkener:
-    """Curves from a network that sees the neighbourhood of every pixel; compiled once for every size of picture."""
+    """A darkener by curves from a network that sees the neighbourhood of every pixel; compiled for each image size."""
     compiled = jax.jit(lambda light, exposure: curve_network.iterate(light, curve_network.curves(net, light, exposure)))
     return lambda light, exposure: np.asarray(compiled(jnp.asarray(light), jnp.asarray(exposure)))
 
 
 def analytic_darkener(sample: Float32[np.ndarray, " N"], exposure: float) -> Darkener:
-    """One tone curve for all pixels, y = s x + (1 - s) x^33: a scale s, from which only highlights depart towards 1.
+    """A darkener by one tone curve for all pixels, y = s x + (1 - s) x^33: a scale s, except that highlights tend to 1.
 
-    It keeps the order of lightnesses, and nearly their ratios: a video that is darkened by one such curve does not
-    flicker as its content changes.
+    It preserves the order of lightnesses and nearly their ratios; a video darkened by one such curve does not flicker
+    as its content changes.
 
     Args:
-        sample: lightness of pixels of everything that the curve is for; s brings the mean of those that are not
-            saturated to the exposure, and is 1 if they are darker than that.
+        sample: lightness of pixels from all pictures that the curve is for; s brings the mean of the unsaturated ones
+            to the exposure, and is 1 if they are already darker.
         exposure: as for `darken`.
     """
     rest = sample[~saturated(sample)]
@@ -86,14 +86,14 @@ def analytic_darkener(sample: Float32[np.ndarray, " N"], exposure: float) -> Dar
 
 
 def scale_light(image: Image, factor: float) -> Image:
-    """The picture with `factor` times the light, sRGB in [0, 1]: 1 leaves it exactly as it is."""
+    """The picture with `factor` times the light, sRGB in [0, 1]; a factor of 1 leaves it exactly unchanged."""
     if factor == 1:
         return image
     return linear_to_srgb(np.clip(factor * srgb_to_linear(image), 0, 1)).astype(np.float32)
 
 
 def add_sensor_noise(image: Image, seed: tuple[int, ...], photons: float, read_noise: float) -> Image:
-    """Photon (Poisson) and read-out (Gaussian) noise of a sensor that sees linear light.
+    """Add photon noise (Poisson) and read noise (Gaussian) of a sensor, in linear light.
 
     Args:
         image: sRGB values in [0, 1].
@@ -107,5 +107,5 @@ def add_sensor_noise(image: Image, seed: tuple[int, ...], photons: float, read_n
 
 
 def truncate(image: Image) -> UInt8[np.ndarray, "H W 3"]:
-    """Eight bits by truncation; values that rounding errors keep from a whole level count as that level."""
+    """Truncate to 8 bits; values that are below a whole level only by rounding errors count as that level."""
     return np.floor(255 * np.clip(image, 0, 1) + 1e-3).astype(np.uint8)

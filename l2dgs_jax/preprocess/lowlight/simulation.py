@@ -1,4 +1,4 @@
-"""A low-light twin of a scene, with the scene itself as its truth."""
+"""Low-light twins of well-lit scenes, with the scenes themselves as ground truth."""
 
 import dataclasses
 import math
@@ -22,9 +22,9 @@ from l2dgs_jax.visualize.sheet import sheet
 Bytes = UInt8[np.ndarray, "H W 3"]
 
 
-MOST = 1e9  # electrons
-DRIFT_WAVES = 1.5  # of exposure while a video lasts
-SAMPLE = 1_000_000  # pixels of a video that the analytic curve is fitted to
+MAX_ELECTRONS = 1e9
+DRIFT_PERIODS = 1.5  # of the wave by which exposure drifts, over the whole video
+SAMPLED_PIXELS = 1_000_000  # of a video, that the analytic curve is fitted to
 
 
 @dataclass(frozen=True)
@@ -32,15 +32,19 @@ class DarkeningConfig:
     """How a scene is darkened.
 
     Attributes:
-        method: one analytic curve for the whole video, or curves by a network, which sees every pixel's neighbourhood.
-        weights: of the network: LEDNet's ce_zerodce.pth or an .npz of experiments.makers.train_darkener; else our own.
-        exposure: mean lightness of the dark frames, saturated pixels aside; drawn from the range if not given.
+        method: "analytic", one curve for the whole video, or "network", curves from a network that sees every pixel's
+            neighbourhood.
+        weights: file with the network's weights: LEDNet's ce_zerodce.pth or an .npz of
+            experiments.makers.train_darkener; if not given, those of this package.
+        exposure: mean lightness of the dark frames, not counting saturated pixels; drawn from the range if not given.
         exposure_range: lowest and highest exposure to draw (LEDNet: 0.05 0.3).
-        per_image: draw an exposure for every frame, which makes videos flicker, instead of one for all.
-        exposure_drift: share by which the light that the camera gathers swells and fades while it films.
-        photons: electrons that white stands for; gives the sensor noise if set.
-        read_noise: of that sensor, in electrons.
-        lab_order: lightness as it should be, or with red and blue swapped as in LEDNet's script.
+        per_image: draw an exposure for every frame, which makes videos flicker, instead of one for all frames.
+        exposure_drift: amplitude by which the light that the camera gathers rises and falls over the video, relative
+            to its mean; 0 for constant exposure.
+        photons: electrons per pixel that white stands for; if given, sensor noise is added, the more the fewer they
+            are.
+        read_noise: standard deviation of the sensor's read noise, in electrons.
+        lab_order: how lightness is computed: "correct", or "lednet", with red and blue swapped as in LEDNet's script.
         allow_brightening: let pixels become brighter where the network says so, as LEDNet does.
         seed: of exposures and noise.
     """
@@ -58,10 +62,10 @@ class DarkeningConfig:
     seed: int = 0
 
     def check(self) -> None:
-        """Refuse settings that make no sense.
+        """Check the settings.
 
         Raises:
-            UserError: there is one.
+            UserError: one of them is invalid.
         """
         low, high = self.exposure_range if self.exposure is None else (self.exposure,) * 2
         if not 0 < low <= high < 1:
@@ -73,8 +77,13 @@ class DarkeningConfig:
             raise UserError(f"--exposure-drift {self.exposure_drift:g}: expected a share from 0, below 1")
         if self.weights is not None and self.method != "network":
             raise UserError("--weights: go with --method network; expected that method, or no weights")
-        if self.photons is not None and not (0 < self.photons <= MOST and 0 <= self.read_noise <= MOST):
-            raise UserError(f"--photons and --read-noise: expected electrons, more than 0 and from 0, at most {MOST:g}")
+        if self.photons is not None and not (
+            0 < self.photons <= MAX_ELECTRONS and 0 <= self.read_noise <= MAX_ELECTRONS
+        ):
+            raise UserError(
+                "--photons and --read-noise: expected electrons, the former more than 0, the latter at least 0, "
+                f"both at most {MAX_ELECTRONS:g}"
+            )
         if self.seed < 0:
             raise UserError(f"--seed {self.seed}: expected a whole number from 0")
 
@@ -83,11 +92,11 @@ class FrameReport(NamedTuple):
     """How dark a frame became.
 
     Attributes:
-        exposure: that was asked for.
-        light: factor on the light by which this frame departs from it.
+        exposure: the exposure that was asked for.
+        light: additional factor on the light of this frame, from the drift of exposure.
         psnr: dB, of the dark frame against the well-lit one; None if they are equal.
         level: mean sRGB value of the dark frame.
-        welllit_level: of the well-lit one.
+        welllit_level: mean sRGB value of the well-lit frame.
     """
 
     exposure: float
@@ -98,12 +107,12 @@ class FrameReport(NamedTuple):
 
 
 def darken(dataset: Dataset, cfg: DarkeningConfig) -> tuple[Dataset, dict[str, FrameReport]]:
-    """The low-light twin of a scene: its pictures darkened, themselves as the truth; and a report on every frame.
+    """The low-light twin of a scene, whose ground truth are the original pictures, and a report on every frame.
 
-    Colours of points are dropped: they were seen in the light.
+    Colours of points are dropped because they are well-lit.
 
     Raises:
-        UserError: the scene is no brighter than the exposure, or has well-lit pictures of some frames only.
+        UserError: the scene is not brighter than the exposure, or has well-lit pictures of one split only.
     """
     names = dataset.train.names + dataset.test.names
     pictures = [to_bytes(picture) for picture in _sources(dataset)]
@@ -133,7 +142,7 @@ def darken(dataset: Dataset, cfg: DarkeningConfig) -> tuple[Dataset, dict[str, F
 
 
 def contact_sheet(dataset: Dataset, rows: int = 4) -> UInt8[np.ndarray, "H W 3"]:
-    """A few training frames, spread over time: well-lit, dark, and the dark one brought back to the same mean."""
+    """A few training frames, spread over time: well-lit, dark, and the dark one scaled to the well-lit mean."""
     split = dataset.train
     assert split.welllit is not None
     in_time = np.argsort(split.cameras.time, kind="stable")
@@ -150,7 +159,7 @@ def contact_sheet(dataset: Dataset, rows: int = 4) -> UInt8[np.ndarray, "H W 3"]
 
 
 def _sources(dataset: Dataset) -> Iterator[Float16[np.ndarray, "H W 3"]]:
-    """The well-lit pictures of all frames: those called so, or else the only ones."""
+    """The well-lit pictures of all frames: those of `Split.welllit`, or else the only ones."""
     splits = [split for split in (dataset.train, dataset.test) if split.names]
     known = [split.welllit is not None for split in splits]
     if any(known) and not all(known):
@@ -174,10 +183,10 @@ def _exposures(count: int, cfg: DarkeningConfig) -> list[float]:
 
 
 def _lights(dataset: Dataset, cfg: DarkeningConfig) -> list[float]:
-    """Factors on the light of all frames: a wave in time, begun at random."""
+    """Factors on the light of all frames: a sine wave over time with a random phase."""
     times = np.concatenate([split.cameras.time for split in (dataset.train, dataset.test)])
     begin = np.random.default_rng((cfg.seed, 1)).uniform()
-    return (1 + cfg.exposure_drift * np.sin(2 * np.pi * (begin + DRIFT_WAVES * times))).tolist()
+    return (1 + cfg.exposure_drift * np.sin(2 * np.pi * (begin + DRIFT_PERIODS * times))).tolist()
 
 
 def _darkener(
@@ -187,16 +196,16 @@ def _darkener(
     name: str,
     cfg: DarkeningConfig,
 ) -> Callable[[int], darkening.Darkener]:
-    """The darkener of every frame, by its index, as its pixels that count suggest.
+    """A function that gives the darkener of each frame, by index; analytic ones are fitted to the pixels that count.
 
     Raises:
-        UserError: the pictures are no brighter than the exposure, or the weights cannot be read.
+        UserError: the pictures are not brighter than the exposure, or the weights cannot be read.
     """
 
     def light(i: int) -> Float32[np.ndarray, " P"]:
         return darkening.lightness(_floats(pictures[i]), cfg.lab_order)[counted[i]]
 
-    stride = -(-sum(picture.size // 3 for picture in pictures) // SAMPLE)
+    stride = -(-sum(picture.size // 3 for picture in pictures) // SAMPLED_PIXELS)
     sample = np.concatenate([light(i)[::stride] for i in range(len(pictures))])
     if sample.mean() <= darkening.exposure_map(sample, min(exposures)).mean():
         raise UserError(
@@ -219,7 +228,7 @@ def _twin(split: Split, dark: list[Bytes], welllit: list[Bytes]) -> Split:
 
 
 def _stack(pictures: list[Bytes]) -> Float16[np.ndarray, "F H W 3"]:
-    """Values in [0, 1] at the precision of a scene's frames."""
+    """Values in [0, 1] as half floats, like the frames of a data set."""
     return np.stack([_floats(picture).astype(np.float16) for picture in pictures])
 
 
@@ -228,7 +237,7 @@ def _floats(picture: Bytes) -> Float32[np.ndarray, "H W 3"]:
 
 
 def mean_report(frames: dict[str, FrameReport]) -> dict[str, float | None]:
-    """Means of the reports over the frames; None where some frame has none."""
+    """Means of the reports over the frames; None if a frame has None."""
     columns = zip(*frames.values(), strict=True)
     return {
         key: None if None in values else float(np.mean(values))

@@ -1,4 +1,4 @@
-"""Weights of the curve network on disk: those that ship, those that a user trained, and LEDNet's release."""
+"""Weights of the curve network on disk: those of this package, those that a user has trained, and LEDNet's release."""
 
 from pathlib import Path
 
@@ -21,8 +21,8 @@ _LAYERS = tuple(f"e_conv{name}" for name in ("_e1", "_e2", "_e3", "_e4", 1, 2, 3
 def load(path: Path = SHIPPED) -> curve_network.CurveNet:
     """Read the parameters of a network of any width.
 
-    Both kinds of file hold the arrays that the released `ce_zerodce.pth` holds: e_conv_e1 ... e_conv_e4 and e_conv1 ...
-    e_conv7, each a `.weight` in OIHW order and a `.bias`.
+    Both kinds of file hold the arrays of the released `ce_zerodce.pth`: a `.weight` in OIHW order and a `.bias` each of
+    e_conv_e1 ... e_conv_e4 and e_conv1 ... e_conv7.
 
     Args:
         path: an .npz as `save` writes it, or a state_dict as torch.save writes it.

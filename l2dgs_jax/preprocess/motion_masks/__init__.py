@@ -1,4 +1,4 @@
-"""Where things move in a video of known cameras."""
+"""Masks of what moves in a video with known camera poses."""
 
 from l2dgs_jax.preprocess.motion_masks.scene_masks import as_taken, compute_masks, preview, write_masks
 

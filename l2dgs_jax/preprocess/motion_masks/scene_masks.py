@@ -22,16 +22,16 @@ from l2dgs_jax.types import Camera
 from l2dgs_jax.visualize.sheet import sheet
 
 PREVIEW_ROWS = 12
-PREVIEW_LEVEL = 0.45  # mean that the preview's pictures are brightened to
+PREVIEW_LEVEL = 0.45  # mean to which the preview's pictures are brightened
 
 
 def compute_masks(dataset: Dataset) -> Bool[np.ndarray, "F H W"]:
-    """Masks of what moves, of the training frames and then the held-out ones, showing progress.
+    """Masks of what moves, first of the training frames and then of the held-out ones; shows progress.
 
-    Both are looked at together: held-out frames are few, and training frames of other instants show what moved.
+    Frames of both splits are matched with each other, because held-out frames are few.
 
     Raises:
-        UserError: all frames are of one instant.
+        UserError: all frames have the same instant.
     """
     cameras, images = _all_frames(dataset)
     masks = np.zeros(images.shape[:3], bool)
@@ -45,7 +45,7 @@ def compute_masks(dataset: Dataset) -> Bool[np.ndarray, "F H W"]:
 
 
 def as_taken(mask: Bool[np.ndarray, "h w"], downscale: int, original: Original) -> Bool[np.ndarray, "H W"]:
-    """A mask of a frame as it is loaded, as a mask of the picture that the frame was loaded from."""
+    """Turn a mask of a frame as loaded into a mask of the original picture: full size, with lens distortion."""
     width, height = original.size
     full = mask.astype(np.uint8).repeat(downscale, axis=0).repeat(downscale, axis=1)
     full = np.pad(full, ((0, height - full.shape[0]), (0, width - full.shape[1])), mode="edge")
@@ -53,13 +53,13 @@ def as_taken(mask: Bool[np.ndarray, "h w"], downscale: int, original: Original) 
 
 
 def write_masks(folder: Path, names: Sequence[str], masks: Sequence[Bool[np.ndarray, "H W"]]) -> None:
-    """Write `folder/1x/NAME.png`, all of them or none; what was in `folder` is gone afterwards.
+    """Write `folder/1x/NAME.png`, all of them or none; they replace the previous content of `folder`.
 
     Raises:
         UserError: the folder cannot be written.
     """
     try:
-        # Beside `folder`, because a scene with an empty one cannot be read.
+        # Written to a temporary folder beside `folder`, so that an interruption does not leave some of the masks.
         with tempfile.TemporaryDirectory(dir=folder.parent, prefix=".mask-", ignore_cleanup_errors=True) as top:
             new, old = Path(top) / "new", Path(top) / "old"
             for name, mask in zip(names, masks, strict=True):
@@ -74,7 +74,7 @@ def write_masks(folder: Path, names: Sequence[str], masks: Sequence[Bool[np.ndar
 
 
 def preview(dataset: Dataset, masks: Bool[np.ndarray, "F H W"]) -> UInt8[np.ndarray, "h w 3"]:
-    """Frames spread over time, training and held out, as they are, brightened for matching, and with masks in red.
+    """Some training and held-out frames, spread over time: as they are, brightened for matching, with masks in red.
 
     Args:
         dataset: the scene.
