@@ -33,10 +33,10 @@ class Render:
 
     Attributes:
         run: folder of the run.
-        path: camera path. dataset: the views of a split, whose name is PATH; interpolate: along the training views;
-            spiral: around the most central training view; orbit: around what the cameras look at; freeze-time: along
-            the training views while time stands still; freeze-camera: a fixed camera while time runs; or a
-            camera_path.json of nerfstudio, whose name is PATH.
+        path: camera path. dataset: the views of a split (PATH above is then its name); interpolate: along the training
+            views; spiral: around the most central training view; orbit: around what the cameras look at; freeze-time:
+            along the training views while time stands still; freeze-camera: a fixed camera while time runs; or a
+            camera_path.json of nerfstudio (PATH above is then its name).
         split: views to render, for --path dataset.
         frames: number of pictures along a path; 96 if not given.
         times: first and last instant of a path, in [0, 1]; 0 and 1 if not given.

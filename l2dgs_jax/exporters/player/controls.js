@@ -1,10 +1,10 @@
-// Mouse and touch on the canvas, and keys unless another control has the focus.
+// Controls of the camera: mouse and touch on the canvas, and keys unless another control has the focus.
 
-const RADIANS = 1.5; // that a drag over the shorter side of the canvas turns the view by
-const KEY_STEP = 0.06; // of the shorter side
+const RADIANS = 1.5; // angle that a drag as long as the shorter side of the canvas turns the view by
+const KEY_STEP = 0.06; // drag that an arrow key stands for, relative to the shorter side of the canvas
 const ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
 
-// `getView` gives the view to change, `getFocal` its focal length in CSS pixels, and `changed` is called afterwards.
+// `getView` returns the view to change, `getFocal` its focal length in CSS pixels; `changed` is called after a change.
 function steer(canvas, getView, getFocal, changed) {
   const pointers = new Map();
   const shorter = () => Math.min(canvas.clientWidth, canvas.clientHeight);

@@ -1,7 +1,7 @@
-// The page: what it shows, when, and the controls around it.
+// The page: what the canvas shows, playback, and the buttons.
 
-const LARGEST_CUT = 2; // a side of the picture over the part of it that a canvas of another shape shows
-const MOST_PIXELS = 2; // of the canvas to a CSS pixel
+const LARGEST_CUT = 2; // a side of the picture over the part of it that stays visible if the canvas has another shape
+const MOST_PIXELS = 2; // largest number of canvas pixels per CSS pixel
 const element = (id) => document.getElementById(id);
 
 class Player {
@@ -41,8 +41,8 @@ class Player {
     );
   }
 
-  // The lens of the camera that the view started from, enlarged until the picture fills the canvas, unless more would
-  // be cut off than is left.
+  // The lens of the camera that the view started from, enlarged until the picture fills the canvas, but no further than
+  // LARGEST_CUT allows.
   lens() {
     const { width, height, dilation } = this.scene;
     const size = [this.canvas.width, this.canvas.height];
@@ -52,7 +52,7 @@ class Player {
     return {
       focal: focal.map((pixels) => scale * pixels),
       principal: [width, height].map((side, i) => size[i] / 2 + scale * (principal[i] - side / 2)),
-      dilation: dilation * Math.max(scale ** 2, 1), // the blur of a pixel is part of what was trained
+      dilation: dilation * Math.max(scale ** 2, 1), // trained with a blur in pixels of the training views
     };
   }
 
@@ -62,7 +62,7 @@ class Player {
     this.changed();
   }
 
-  // Where the camera stood that filmed this moment.
+  // Move to the camera that filmed this instant.
   stand() {
     this.camera = cameraAt(this.scene, this.time);
     this.view = new View(this.camera, this.scene.up);

@@ -1,11 +1,11 @@
-// Draws the tracks as the rasterizer of l2dgs_jax does: the farthest first, premultiplied, over the background.
+// Draws the tracks as the rasterizer of l2dgs_jax does, but back to front, with premultiplied alpha.
 
-const TEXELS = 2048; // in a row of a texture; every device has as many
+const TEXELS = 2048; // in a row of a texture; every WebGL 2 device allows as many
 
 function createRenderer(canvas, scene) {
   const gl = canvas.getContext("webgl2", { alpha: false, antialias: false, powerPreference: "high-performance" });
   if (!gl) throw new Error("This browser offers no WebGL 2, which the scene is drawn with.");
-  // Colours blended in bytes would be rounded once for each Gaussian in front of another.
+  // In a framebuffer of bytes, colours would be rounded again with every Gaussian that is blended.
   const halfFloats = gl.getExtension("EXT_color_buffer_float") || gl.getExtension("EXT_color_buffer_half_float");
   const splats = program(gl, "splat-vertex-shader", "splat-fragment-shader");
   const screen = program(gl, "screen-vertex-shader", "screen-fragment-shader");
@@ -49,7 +49,7 @@ function createRenderer(canvas, scene) {
     count = sorted.length;
   }
 
-  // `lens` has focal, principal and dilation in pixels of the canvas; `image` is the number of the colours.
+  // `lens` has focal, principal and dilation in pixels of the canvas; `image` is the index of the set of colours.
   function draw(view, lens, { key, part }, image) {
     const at = splats.uniforms;
     gl.viewport(0, 0, canvas.width, canvas.height);
@@ -115,7 +115,7 @@ function program(gl, ...sources) {
   return { program: linked, uniforms };
 }
 
-// An array of rows as a texture, texel by texel, line by line.
+// An array as a texture: each of its rows is one texel, and texels fill the texture line by line.
 function table(gl, rows, internal, format, type, channels) {
   const count = rows.length / channels;
   const lines = Math.floor(count / TEXELS);

@@ -1,4 +1,4 @@
-// What the page holds: a description in JSON, and tracks of Gaussians, deflated integers in base64.
+// Reads the data in the page: a description in JSON, and the tracks of the Gaussians as deflated integers in base64.
 
 async function readScene() {
   const scene = JSON.parse(document.getElementById("description").textContent);
@@ -6,7 +6,7 @@ async function readScene() {
   const { keys, still, moving, images } = scene;
   let start = 0;
 
-  // Undoes `pack` of exporters/tracks.py: byte by byte, channel by channel, differences from one instant to the next.
+  // Undoes `pack` of exporters/tracks.py: the bytes, in planes, of the differences between instants, per channel.
   function next(Type, instants, count, channels) {
     const rows = new Type(instants * count * channels);
     for (let channel = 0; channel < channels; channel++) {

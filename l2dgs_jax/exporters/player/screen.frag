@@ -1,5 +1,5 @@
 #version 300 es
-// What was blended, over the background.
+// Composites the blended Gaussians over the background.
 precision highp float;
 
 uniform sampler2D blended;

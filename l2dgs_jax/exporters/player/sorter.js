@@ -1,7 +1,7 @@
-// A worker: the Gaussians in front of the camera, farthest first.
+// A worker that sorts the Gaussians in front of the camera, farthest first.
 //
-// It is told once { positions, still, moving } and then, for every order, { key, part, row, offset, nearPlane }: the
-// depth of a Gaussian is `row` times its position in the integers of the file, plus `offset`.
+// It receives { positions, still, moving } once, and { key, part, row, offset, nearPlane } for every sort: the depth of
+// a Gaussian is the dot product of `row` and its quantised position, plus `offset`.
 
 let scene;
 
@@ -26,7 +26,7 @@ function depths({ key, part, row, offset }) {
   return result;
 }
 
-// Floats above zero are ordered as their bits are, which makes this an exact radix sort, 16 bits at a time.
+// A radix sort of 16 bits at a time, which is exact because positive floats are ordered like their bits.
 function farthestFirst(depths, nearPlane) {
   const bits = new Uint32Array(depths.buffer);
   const visible = new Uint32Array(depths.length);

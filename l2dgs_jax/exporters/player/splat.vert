@@ -1,5 +1,5 @@
 #version 300 es
-// A Gaussian between two key instants, projected to first order around its centre (EWA), over all that can be seen of it.
+// A Gaussian between two key instants, projected to first order around its centre (EWA), as a quad that covers it.
 precision highp float;
 precision highp int;
 precision highp usampler2D;
@@ -9,7 +9,7 @@ uniform sampler2D quats, shapes, colors;
 uniform int still, moving, key;
 uniform float part;
 uniform vec3 boxLow, boxSize;
-uniform vec2 logScales;  // the lowest, and how far up the highest is
+uniform vec2 logScales;  // the smallest, and the difference of the largest from it
 uniform float brightest;
 uniform mat3 rotation;  // world to camera: x right, y down, z forward
 uniform vec3 translation;
@@ -60,7 +60,7 @@ void main() {
   vec3 u = focal.x / seen.z * (vec3(1.0, 0.0, -tangent.x) * turned) * scales;
   vec3 v = focal.y / seen.z * (vec3(0.0, 1.0, -tangent.y) * turned) * scales;
 
-  // The Cholesky factor of the covariance takes a square around the circle of what can be seen to the ellipse's.
+  // The Cholesky factor of the covariance maps a circle to the ellipse, and the square around it to the quad.
   float xx = dot(u, u), xy = dot(u, v), yy = dot(v, v);
   float determinant = max(xx * yy - xy * xy, 0.0) + dilation * (xx + yy + dilation);
   float across = sqrt(xx + dilation);

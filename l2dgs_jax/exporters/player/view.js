@@ -5,8 +5,8 @@ const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a
 const along = (point, direction, length) => point.map((value, i) => value + length * direction[i]);
 const unit = (a) => a.map((value) => value / Math.hypot(...a));
 
-const STEEPEST = 0.98; // cosine between where the camera looks and the vertical
-const NEAREST = 0.02; // distance from the point that it turns around, over the first one
+const STEEPEST = 0.98; // largest cosine between the viewing direction and the vertical
+const NEAREST = 0.02; // least distance from the point that the camera turns around, relative to the initial one
 
 function rotated(vector, axis, angle) {
   const aside = cross(axis, vector);
@@ -14,7 +14,7 @@ function rotated(vector, axis, angle) {
   return vector.map((value, i) => value * cosine + aside[i] * sine + axis[i] * up);
 }
 
-// The camera that filmed an instant: between two training cameras; the nearest one if they are no path.
+// The camera that filmed an instant, interpolated between two training cameras; the nearest one if they form no path.
 function cameraAt({ cameras, path }, time) {
   const next = cameras.findIndex((camera) => camera.time >= time);
   if (next < 1) return cameras.at(next);
@@ -26,7 +26,7 @@ function cameraAt({ cameras, path }, time) {
 }
 
 class View {
-  // `distance` of a camera is that of the point it turns around.
+  // The camera turns around the point that lies `distance` in front of it.
   constructor({ axes, centre, distance }, up) {
     const forward = unit(axes[2]);
     const right = unit(cross(axes[1], forward));
@@ -42,7 +42,7 @@ class View {
     return this.axes.map((axis) => -dot(axis, centre));
   }
 
-  // Turn by angles in radians, as a hand that drags the scene to the right and downwards would turn it.
+  // Turn the scene, as if dragged by hand, to the right and downwards by these angles in radians.
   turn(right, down) {
     const yawed = this.axes.map((axis) => rotated(axis, this.up, -right));
     const turned = yawed.map((axis) => rotated(axis, yawed[0], -down));
@@ -50,7 +50,7 @@ class View {
     this.axes = after < Math.max(STEEPEST, before) ? turned : yawed;
   }
 
-  // Move with the scene under the hand, by parts of the distance.
+  // Move the scene, as if dragged by hand, to the right and downwards by these fractions of the distance.
   move(right, down) {
     this.target = along(this.target, this.axes[0], -right * this.distance);
     this.target = along(this.target, this.axes[1], -down * this.distance);

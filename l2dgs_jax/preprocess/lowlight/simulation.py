@@ -41,12 +41,12 @@ class DarkeningConfig:
         per_image: draw an exposure for every frame, which makes videos flicker, instead of one for all frames.
         exposure_drift: amplitude by which the light that the camera gathers rises and falls over the video, relative
             to its mean; 0 for constant exposure.
-        photons: electrons per pixel that white stands for; if given, sensor noise is added, the more the fewer they
-            are.
+        photons: electrons per pixel that white stands for; if given, sensor noise is added, which is stronger for fewer
+            electrons.
         read_noise: standard deviation of the sensor's read noise, in electrons.
         lab_order: how lightness is computed: "correct", or "lednet", with red and blue swapped as in LEDNet's script.
         allow_brightening: let pixels become brighter where the network says so, as LEDNet does.
-        seed: of exposures and noise.
+        seed: seed of exposures and noise.
     """
 
     method: Literal["analytic", "network"] = "analytic"
