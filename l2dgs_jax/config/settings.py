@@ -155,7 +155,7 @@ class ModelConfig:
         if not 0 < self.moving_share <= 1:
             raise UserError(f"--model.moving-share {self.moving_share}: expected more than 0 and at most 1")
         if self.domain == "light" and isinstance(self.tone, float | int):
-            raise UserError(f"--model.tone {self.tone}: is for sRGB values; expected --model.domain values or auto with it")
+            raise UserError(f"--model.tone {self.tone}: applies to sRGB values; expected --model.domain values or auto")
 
 
 @dataclass(frozen=True)
