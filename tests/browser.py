@@ -1,4 +1,4 @@
-"""A browser that plays a video and says what it saw, and one that shows a page and does as it is told."""
+"""Chromium for tests: it plays a video and reports what it saw, or shows a page and is driven by the test."""
 
 import base64
 import contextlib
@@ -31,9 +31,9 @@ video.onended = () => {
 
 
 def played(path, profile, seconds=30):
-    """What Chromium says once the video is over: "ended", width, height, and red, green, blue of the middle pixel.
+    """What Chromium reports once the video is over: "ended", width, height, and red, green, blue of the middle pixel.
 
-    Virtual time would be over before a video is, so a server on this machine waits for the word.
+    Virtual time would be over before a video is, so a local server waits for the report.
     """
     said = queue.Queue()
     types = {".mp4": "video/mp4", ".webm": "video/webm"}
@@ -84,14 +84,14 @@ def opened(address, profile, size=(800, 500)):
             def tab():
                 request = urllib.request.Request(f"http://127.0.0.1:{port}/json/new", method="PUT")
                 with urllib.request.urlopen(request) as answer:
-                    place = json.load(answer)["webSocketDebuggerUrl"]
-                return Page(stack.enter_context(connect(place, max_size=None)), address, size)
+                    socket_address = json.load(answer)["webSocketDebuggerUrl"]
+                return Page(stack.enter_context(connect(socket_address, max_size=None)), address, size)
 
             yield tab
 
 
 def awaited(question, seconds=60):
-    """What `question` answers once that is something; errors are no answers."""
+    """The first true answer to `question`, asked repeatedly; errors of files and indices are no answers."""
     end = time.monotonic() + seconds
     while time.monotonic() < end:
         with contextlib.suppress(OSError, IndexError):
@@ -190,10 +190,10 @@ class Page:
 
     def complaints(self):
         """Errors on the console, and exceptions."""
-        told = [e["params"] for e in self._events if e["method"] == "Runtime.consoleAPICalled"]
+        calls = [e["params"] for e in self._events if e["method"] == "Runtime.consoleAPICalled"]
         logged = [e["params"]["entry"] for e in self._events if e["method"] == "Log.entryAdded"]
         thrown = [e["params"] for e in self._events if e["method"] == "Runtime.exceptionThrown"]
-        return [x for x in told if x["type"] == "error"] + [x for x in logged if x["level"] == "error"] + thrown
+        return [x for x in calls if x["type"] == "error"] + [x for x in logged if x["level"] == "error"] + thrown
 
     def addresses(self):
         """What it has asked the network for."""

@@ -11,7 +11,7 @@ import pytest
 from jaxtyping import install_import_hook
 
 jax.config.update("jax_enable_x64", True)
-jax.config.update("jax_num_cpu_devices", 4)  # what runs on one device does not notice
+jax.config.update("jax_num_cpu_devices", 4)  # tests on one device are not affected
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 install_import_hook("l2dgs_jax", "beartype.beartype")

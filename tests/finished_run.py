@@ -1,6 +1,6 @@
 """A tiny run folder as training leaves it, made once per test session.
 
-Its scene is as it was before the first step, with a motion field that already moves: enough for the tools that look at
+Its scene is the initial one, with a motion field that already moves: enough for the tools that look at
 runs, and no training step to compile.
 """
 
@@ -26,8 +26,8 @@ HELD_OUT = (2, 6)  # every fourth frame
 def folder(base):
     """The run folder under `base`, for the command lines; its scene lies beside it."""
     scene = write_nerfies(base / "tiny_scene", FRAMES, WIDTH, HEIGHT, num_points=40, truth=True)
-    still = scene / "mask" / "1x" / f"{HELD_OUT[1]:06d}.png"  # a frame in which nothing moves
-    write_image(still, np.zeros((HEIGHT, WIDTH)))
+    still_mask = scene / "mask" / "1x" / f"{HELD_OUT[1]:06d}.png"  # a frame in which nothing moves
+    write_image(still_mask, np.zeros((HEIGHT, WIDTH)))
     preset = PRESETS["default"]
     model = dataclasses.replace(
         preset.model,

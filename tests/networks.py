@@ -1,4 +1,4 @@
-"""Networks like LPIPS's with made-up weights, whole or too small to be of use."""
+"""Networks like LPIPS's with random weights, in full size or tiny."""
 
 import numpy as np
 

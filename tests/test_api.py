@@ -1,4 +1,4 @@
-"""What `import l2dgs_jax` offers: all that its signatures mention, and the README's programs."""
+"""The public API: it exports all that its signatures mention, and the README's programs run."""
 
 import inspect
 import re
@@ -38,7 +38,7 @@ def public_functions():
             yield from (f for key, f in vars(thing).items() if inspect.isfunction(f) and not key.startswith("_"))
 
 
-def test_everything_named_is_there():
+def test_everything_that_is_exported_exists():
     assert len(set(l2dgs_jax.__all__)) == len(l2dgs_jax.__all__)
     assert all(hasattr(l2dgs_jax, name) for name in l2dgs_jax.__all__)
     assert l2dgs_jax.__version__ == version("l2dgs-jax")
@@ -46,7 +46,7 @@ def test_everything_named_is_there():
 
 
 @pytest.mark.parametrize("function", list(public_functions()), ids=lambda f: f.__qualname__)
-def test_what_a_signature_mentions_is_exported(function):
+def test_classes_in_public_signatures_are_exported(function):
     mentioned = {c.__name__ for a in function.__annotations__.values() for c in classes_in(a)}
     assert mentioned <= set(l2dgs_jax.__all__)
 
@@ -75,6 +75,6 @@ def test_the_readmes_programs_run_as_printed(tmp_path, monkeypatch):
     monkeypatch.setitem(l2dgs_jax.PRESETS, "demo", config)
     exec(trained, names | {"print": steps.append})
     assert steps == [1, 2]
-    again = l2dgs_jax.open_run("runs/fitted")
-    assert again.state.step == 2
-    assert again.config.coarse_steps == 1
+    reopened = l2dgs_jax.open_run("runs/fitted")
+    assert reopened.state.step == 2
+    assert reopened.config.coarse_steps == 1

@@ -1,4 +1,4 @@
-"""Data moves one way: every layer uses only what comes before it."""
+"""Imports go one way: every layer uses only what comes before it."""
 
 import ast
 from pathlib import Path
@@ -39,7 +39,7 @@ def layer(path):
 
 
 def imported_modules(path):
-    """Dotted names below the package that a file imports; names that are no modules are left on."""
+    """Dotted names within the package that a file imports, with names that are not modules."""
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]
@@ -68,7 +68,7 @@ def test_imports_go_one_way(path):
 
 
 def module_of(name):
-    """The file that an imported name lies in."""
+    """The file in which an imported name is defined."""
     parts = name.split(".")
     for end in range(len(parts), 0, -1):
         base = PACKAGE.joinpath(*parts[:end])
@@ -79,7 +79,7 @@ def module_of(name):
     return None
 
 
-def test_no_file_imports_itself_in_a_circle():
+def test_there_are_no_circular_imports():
     waiting = {path: {module_of(name) for name in imported_modules(path)} & set(MODULES) - {path} for path in MODULES}
     while waiting:
         ready = [path for path, used in waiting.items() if not used & waiting.keys()]
@@ -106,5 +106,5 @@ def test_the_compilers_attributes_stay_in_one_folder(path):
 
 
 @each_module
-def test_a_file_is_read_in_one_sitting(path):
+def test_no_file_exceeds_400_lines(path):
     assert len(path.read_text().splitlines()) <= 400

@@ -56,19 +56,19 @@ def make_dataset(seed=0):
 
 
 def batch_of(split, frames):
-    """A batch as arrays of jax, numbers with a fraction in the precision of the tests."""
+    """A batch as JAX arrays, floats in the precision of the tests."""
     batch = load_batch(split, np.array(frames))
     return jax.tree.map(lambda x: jnp.asarray(x, float) if x.dtype.kind == "f" else jnp.asarray(x), batch)
 
 
 def report(loss=0.0):
-    """Of a step that is not computed."""
+    """The report of a step that is not computed."""
     zero, no = jnp.zeros(1), jnp.zeros(1, bool)
     return StepReport(zero + loss, {"l1": zero}, zero, jnp.zeros(1, jnp.int32), no, no)
 
 
 def finish(dataset, config, state=None, pair_capacity=None):
-    """The last step of a run."""
+    """The progress after the last step of a run."""
     member = engine.Member(dataset.train, config, state or initial_state(dataset, config))
     return collections.deque(engine.run([member], pair_capacity), maxlen=1).pop()
 

@@ -81,8 +81,8 @@ def state_dict(tensors, *, legacy, extra_elements=0, protocol=2):
 
 
 def contiguous(array):
-    whole = array.copy()
-    return View(whole.ravel(), 0, whole.shape, tuple(stride // whole.itemsize for stride in whole.strides))
+    copied = array.copy()
+    return View(copied.ravel(), 0, copied.shape, tuple(stride // copied.itemsize for stride in copied.strides))
 
 
 def zip_file(content, raw, *, byteorder=b"little", compression=zipfile.ZIP_STORED):
@@ -97,7 +97,7 @@ def zip_file(content, raw, *, byteorder=b"little", compression=zipfile.ZIP_STORE
 
 
 def legacy_file(content, raw, *, itemsizes=None, little_endian=True):
-    """The bytes of a file in the format before PyTorch 1.6; storages are of floats of 4 bytes unless said otherwise."""
+    """The bytes of a file in the format before PyTorch 1.6; storages are of floats of 4 bytes by default."""
     system = {"protocol_version": 1001, "little_endian": little_endian, "type_sizes": {"short": 2, "int": 4, "long": 4}}
     parts = [pickle.dumps(x, 2) for x in (0x1950A86A20F9469CFC6C, 1001, system)]
     parts += [content, pickle.dumps(sorted(raw), 2)]

@@ -1,4 +1,4 @@
-"""Files that are damaged or made to do harm, and what a reader says of them."""
+"""Damaged and malicious files, and how a reader refuses them."""
 
 import tracemalloc
 
@@ -8,7 +8,7 @@ import pytest
 from l2dgs_jax.errors import UserError
 
 MANY = 10_000
-# The beginnings are sound; without care the rest fills the memory or takes for ever.
+# They begin soundly; a careless reader runs out of memory or never ends.
 GREEDY_PICKLES = {
     "nested lists": b"\x80\x02]" + MANY * b"]" + MANY * b"a" + b".",
     "nested dictionaries": b"\x80\x02}" + MANY * b"X\0\0\0\0}" + MANY * b"s" + b".",
@@ -31,7 +31,7 @@ def load_bytes(load, folder, content):
 
 
 def refusal(load, folder, content):
-    """The one sentence that is said of a file with that content."""
+    """The one sentence with which a file of that content is refused."""
     with pytest.raises(UserError) as caught:
         load_bytes(load, folder, content)
     message = str(caught.value)
@@ -42,7 +42,7 @@ def refusal(load, folder, content):
 
 
 def frugal_refusal(load, folder, content):
-    """The same, found with little memory."""
+    """The same sentence, given after using little memory."""
     tracemalloc.start()
     try:
         message = refusal(load, folder, content)
@@ -61,8 +61,8 @@ def assert_mutations_are_harmless(load, folder, sound, count, seed):
         if rng.random() < 0.2:
             del content[rng.integers(len(content)) :]
         else:
-            for place in rng.integers(len(content), size=rng.integers(1, 4)):
-                content[place] = rng.integers(256)
+            for offset in rng.integers(len(content), size=rng.integers(1, 4)):
+                content[offset] = rng.integers(256)
         try:
             loaded = load_bytes(load, folder, bytes(content))
         except UserError:

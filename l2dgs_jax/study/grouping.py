@@ -48,10 +48,11 @@ def load_groups(spec: Spec) -> list[list[Trial]]:
 
 
 def _shapes(trial: Trial) -> dict[str, object]:
-    dataset, config = trial.dataset, trial.config
+    dataset, model = trial.dataset, trial.config.model
+    by_frame = model.tracks or model.exposure == "drifting" or model.decomposition == "curve"
     return {
         "image size": f"{dataset.width}x{dataset.height}",
-        "number of training frames": len(dataset.train.names) if config.model.time_size is None else None,
+        "number of training frames": len(dataset.train.names) if by_frame or model.time_size is None else None,
         "having pixels that do not count": dataset.train.valid is not None,
         "having depth": dataset.train.depths is not None,
     }

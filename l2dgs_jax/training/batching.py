@@ -28,13 +28,13 @@ def next_batch(split: Split, config: Config, step: int, flows: Flows | None) -> 
     if flows is None:
         return batch
     valid = np.ones(batch.images.shape[:-1], bool) if batch.valid is None else batch.valid
-    rows: Any = (*batch.cameras, batch.images, valid)
+    rows: Any = (*batch.cameras, batch.frames, batch.images, valid)
     probabilities = _probabilities_between(split, flows, config.inbetweens)
     uniforms, parts = np.random.default_rng((seed % 2**64, step, 1)).random((2, config.batch_size))
     for row, frame in enumerate(indices.tolist()):
         if uniforms[row] < probabilities[frame]:
             view = draw(split, flows, frame, float(parts[row]))
-            for stack, own in zip(rows, (*view.camera, view.image, view.valid), strict=True):
+            for stack, own in zip(rows, (*view.camera, view.frame, view.image, view.valid), strict=True):
                 stack[row] = own
             if batch.depths is not None:
                 batch.depths[row] = 0  # the depth is not known between frames
@@ -60,7 +60,7 @@ def load_batch(split: Split, indices: Int[np.ndarray, " V"]) -> Batch:
     if depths is not None and valid is not None:
         depths[~valid] = 0
     cameras = Camera(*(x[indices] for x in split.cameras))
-    return Batch(cameras, split.images[indices], np.asarray(indices, np.int32), valid, depths)  # type: ignore[arg-type]
+    return Batch(cameras, split.images[indices], np.array(indices, np.int32), valid, depths)  # type: ignore[arg-type]
 
 
 def view_indices(seed: int, step: int, batch_size: int, num_frames: int) -> Int[np.ndarray, " B"]:

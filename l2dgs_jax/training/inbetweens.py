@@ -27,11 +27,13 @@ class View(NamedTuple):
 
     Attributes:
         camera: in NumPy arrays.
+        frame: index of the frame whose image it shows, warped.
         image: sRGB in [0, 1].
         valid: where the image is known.
     """
 
     camera: Camera
+    frame: int
     image: Float16[np.ndarray, "H W 3"]
     valid: Bool[np.ndarray, "H W"]
 
@@ -49,17 +51,15 @@ def draw(split: Split, flows: Flows, frame: int, part: float) -> View:
         part**2 * backward - part * (1 - part) * forward,
         (1 - part) ** 2 * forward - part * (1 - part) * backward,
     )
-    images = [split.images[index].astype(np.float32) for index in (frame, other)]
-    (first, first_seen), (second, second_seen) = map(_warped, images, to_frames)
+    ends = (frame, other)
+    (first, first_seen), (second, second_seen) = (_warped(split, *end) for end in zip(ends, to_frames, strict=True))
     valid = first_seen & second_seen
     difference = np.maximum(_dissimilarity(first, second), _dissimilarity(second, first))
     difference = cv2.blur(np.where(valid, difference, 0), (3, 3))
     valid &= difference < MAX_OVER_MEDIAN * (np.median(difference[valid]) if valid.any() else 0) + MARGIN
-    if split.valid is not None:
-        valid &= split.valid[frame] & split.valid[other]
-    nearer = first if part < 0.5 else second  # their mean would be less noisy, but blurred
+    nearer, shown = (first, frame) if part < 0.5 else (second, other)  # their mean would be less noisy, but blurred
     image = np.where(valid[..., None], np.clip(nearer, 0, 1), 0).astype(np.float16)
-    return View(between(split.cameras, frame, other, part), image, valid)
+    return View(between(split.cameras, frame, other, part), shown, image, valid)
 
 
 def _dissimilarity(
@@ -75,11 +75,14 @@ def _dissimilarity(
 
 
 def _warped(
-    image: Float32[np.ndarray, "H W 3"], flow: Float32[np.ndarray, "H W 2"]
+    split: Split, frame: int, flow: Float32[np.ndarray, "H W 2"]
 ) -> tuple[Float32[np.ndarray, "H W 3"], Bool[np.ndarray, "H W"]]:
-    """The image sampled at each pixel plus its flow, and where that is known."""
+    """The image of a frame sampled at each pixel plus its flow, and where that is known."""
+    image = split.images[frame].astype(np.float32)
     height, width = image.shape[:2]
     at = flow + pixel_indices(height, width)
     known: np.ndarray = np.all((at >= 0) & (at <= (width - 1, height - 1)), axis=-1)  # not where flow is NaN
-    at = np.where(known[..., None], at, 0)
-    return cv2.remap(image, at[..., 0], at[..., 1], cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REPLICATE), known
+    columns, rows = np.moveaxis(np.where(known[..., None], at, 0), -1, 0)
+    if split.valid is not None:
+        known &= cv2.remap(split.valid[frame].astype(np.float32), columns, rows, cv2.INTER_LINEAR) > 0.999
+    return cv2.remap(image, columns, rows, cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REPLICATE), known

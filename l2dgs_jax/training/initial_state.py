@@ -93,7 +93,7 @@ def initial_state(dataset: Dataset, config: Config) -> TrainState:
     seeds = None
     if config.model.tracks:
         # Not the added points: the nearest ones of so many are too near to give the depth of what moves.
-        seeds = find_seeds(dataset.points, train, most=_max_gaussians(train))
+        seeds = find_seeds(dataset.points, train, most=min(_max_gaussians(train), int(config.density.max_gaussians)))
     capacity = len(points) + (0 if seeds is None else len(seeds.points))
     if config.density.start < config.density.stop:
         limit = max(int(config.density.max_gaussians), capacity)

@@ -93,16 +93,17 @@ def _seed(
     frames, instants = track.frames, np.unique(cameras.time)
     times = cameras.time[frames]
     positions, middle = _unprojected(track, cameras, depth), len(frames) // 2
-    # The lifetime extends halfway to the neighbouring instants, at which the track is not seen.
+    # The lifetime extends halfway to the neighbouring instants, at which the track is not seen, and to the end of time
+    # where no frame says so.
+    limits = np.concatenate([[0.0], (instants[:-1] + instants[1:]) / 2, [1.0]])
     first, last = np.searchsorted(instants, times[[0, -1]]).tolist()
-    before, after = instants[max(first - 1, 0)], instants[min(last + 1, len(instants) - 1)]
     columns, rows = track.pixels.astype(int).T
     return Seeds(
         points=positions[middle],
         colors=np.median(split.images[frames, rows, columns], axis=0),
         spacings=SPACING * depth[middle] / cameras.K[frames[middle], 0, 0],
         paths=_fitted_path(weights[frames], positions - positions[middle]),
-        lifetimes=np.array([before + times[0], times[-1] + after]) / 2,
+        lifetimes=limits[[first, last + 1]],
     )
 
 

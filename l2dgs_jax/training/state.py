@@ -20,7 +20,7 @@ class Batch(NamedTuple):
     Attributes:
         cameras: of the views.
         images: sRGB in [0, 1].
-        frames: indices of their training frames.
+        frames: indices of the training frames whose images they show, warped for views between frames.
         valid: pixels to learn from; None for all.
         depths: as in `Split`, 0 where unknown or not to be learned; None if the scene has none.
     """

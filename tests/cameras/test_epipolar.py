@@ -1,4 +1,4 @@
-"""Where still points may appear, against direct projection and hand-made matches."""
+"""Epipolar geometry of static points, compared with direct projection and hand-made matches."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ K = np.array([[100.0, 0, 50], [0, 110, 40], [0, 0, 1]])
 
 
 def rectified(*baselines):
-    """Views beside the first one, each moved to the right by a baseline."""
+    """Geometry between a first view and views moved to its right, one for each baseline."""
     poses = np.tile(np.eye(4), (len(baselines) + 1, 1, 1))
     poses[1:, 0, 3] = -np.array(baselines)
     cameras = Camera(poses, np.tile(K, (len(poses), 1, 1)), np.zeros(len(poses)))
@@ -41,7 +41,7 @@ def pixels_and_depths(cameras, index, points):
 
 
 @pytest.mark.parametrize("scale", [1.0, 1e-3, 1e4])
-def test_still_points_project_exactly_and_leave_no_residual(scale):
+def test_static_points_project_exactly_and_have_no_residual(scale):
     rng = np.random.default_rng(0)
     cameras = random_cameras(rng, 4, scale)
     points = rng.uniform((-1, -1, 3), (1, 1, 5), (20, 3)) * scale
@@ -55,15 +55,15 @@ def test_still_points_project_exactly_and_leave_no_residual(scale):
     assert residuals.max() < 1e-8
 
 
-def test_residual_across_parallel_epipolar_lines_is_their_distance():
+def test_the_residual_is_the_distance_to_the_epipolar_line():
     pixels = np.array([[30.0, 20.0], [60.0, 50.0]])
-    off = np.array([0.0, -2.5])
-    matches = pixels + np.stack([[-7.0, -9.0], off], -1)
+    across = np.array([0.0, -2.5])
+    matches = pixels + np.stack([[-7.0, -9.0], across], -1)
     residuals = static_residuals(rectified(0.2), pixels, matches[None], ANY_DEPTH)
-    np.testing.assert_allclose(residuals[0, 0], np.abs(off), atol=1e-9)
+    np.testing.assert_allclose(residuals[0, 0], np.abs(across), atol=1e-9)
 
 
-def test_beyond_infinity_and_too_near_add_their_part_along_the_line():
+def test_depths_out_of_range_add_a_residual_along_the_line():
     # A baseline of 0.2 shifts depth 1 / w by 20 w pixels to the left.
     pixels = np.array([[50.0, 40.0]])
     for shift, nearest in ((3.0, 0.0), (-26.0, -20.0)):
@@ -71,28 +71,28 @@ def test_beyond_infinity_and_too_near_add_their_part_along_the_line():
         np.testing.assert_allclose(residuals[0, 0], np.hypot(shift - nearest, 4), atol=1e-6)
 
 
-def test_motion_along_the_lines_shows_in_the_third_view():
+def test_motion_along_the_epipolar_line_has_a_residual_in_a_third_view():
     pixels = np.array([[50.0, 40.0]])
-    still = np.array([[[40.0, 40.0]], [[30.0, 40.0]]])  # baselines of 0.2 and 0.4: depth 2 twice
-    assert static_residuals(rectified(0.2, 0.4), pixels, still, ANY_DEPTH).max() < 1e-8
-    moved = still + np.array([[[0.0, 0]], [[6.0, 0]]])
+    static = np.array([[[40.0, 40.0]], [[30.0, 40.0]]])  # baselines of 0.2 and 0.4: depth 2 twice
+    assert static_residuals(rectified(0.2, 0.4), pixels, static, ANY_DEPTH).max() < 1e-8
+    moved = static + np.array([[[0.0, 0]], [[6.0, 0]]])
     residuals = static_residuals(rectified(0.2, 0.4), pixels, moved, ANY_DEPTH)[..., 0]
-    # By its own guess a match fits; then the other one is 6 or, at half the baseline, 3 pixels off.
+    # At the depth that fits one match, the other one is 6 or, at half the baseline, 3 pixels off.
     np.testing.assert_allclose(residuals[:2], [[0, 6], [3, 0]], atol=1e-6)
 
 
-def test_swapping_the_views_of_a_pair_keeps_the_distance():
+def test_swapping_the_views_of_a_pair_keeps_the_residual():
     first, second = np.array([[30.0, 20.0]]), np.array([[23.0, 22.5]])
-    there = static_residuals(rectified(0.2), first, second[None], ANY_DEPTH)
-    back = static_residuals(rectified(-0.2), second, first[None], ANY_DEPTH)
-    np.testing.assert_allclose(there, back, atol=1e-9)
+    forward = static_residuals(rectified(0.2), first, second[None], ANY_DEPTH)
+    backward = static_residuals(rectified(-0.2), second, first[None], ANY_DEPTH)
+    np.testing.assert_allclose(forward, backward, atol=1e-9)
 
 
-def test_pure_rotation_leaves_no_choice():
+def test_under_pure_rotation_the_residual_is_the_distance_to_a_single_pixel():
     cameras = random_cameras(np.random.default_rng(1), 2)
     cameras.viewmat[:, :3, 3] = 0
     geometry = epipolar_geometry(cameras, 0, 1)
     pixels = np.array([[20.0, 30.0], [70.0, 10.0]])
-    ends = project(geometry, pixels, np.ones(2))
-    residuals = static_residuals(stacked([geometry]), pixels, ends[None] + [3.0, 4.0], ANY_DEPTH)
+    projected = project(geometry, pixels, np.ones(2))
+    residuals = static_residuals(stacked([geometry]), pixels, projected[None] + [3.0, 4.0], ANY_DEPTH)
     np.testing.assert_allclose(residuals, 5, atol=1e-9)

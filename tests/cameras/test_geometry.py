@@ -1,4 +1,4 @@
-"""Where cameras are, and cameras of other sizes."""
+"""Positions, depths and projections of cameras, and cameras of other image sizes."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -23,7 +23,7 @@ def cameras(centres):
 CENTRES = np.random.default_rng(1).normal(size=(5, 3))
 
 
-def test_centres_of_numpys_and_of_jaxs_cameras():
+def test_centres_of_cameras_in_numpy_and_jax():
     viewmats = cameras(CENTRES).viewmat
     np.testing.assert_allclose(camera_centres(viewmats), CENTRES, atol=1e-12)
     np.testing.assert_allclose(camera_centres(jnp.asarray(viewmats[2])), CENTRES[2], atol=1e-12)
@@ -37,7 +37,7 @@ def test_the_extent_is_the_radius_with_a_margin():
     assert camera_extent(cameras(circle[:1])) == 0
 
 
-def test_cameras_all_around_agree_on_up():
+def test_mean_up_of_cameras_all_around_is_the_up_of_the_world():
     world = Rotation.from_rotvec([0.4, -1.1, 0.7])
     headings = Rotation.from_euler("YX", [[angle, 0.6] for angle in (0, np.pi / 2, np.pi, -np.pi / 2)])
     viewmats = np.tile(np.eye(4), (4, 1, 1))
@@ -48,7 +48,7 @@ def test_cameras_all_around_agree_on_up():
 
 
 @pytest.mark.parametrize("of", [lambda batch: select_camera(batch, 2), lambda batch: batch], ids=["one", "each"])
-def test_points_project_to_where_their_rays_came_from(of):
+def test_points_project_to_the_pixels_of_their_rays(of):
     camera = of(cameras(CENTRES))
     pixels, depths = np.random.default_rng(2).uniform(1, 20, (5, 2)), np.array([0.5, 1, 3, 9, -2])
     rays = np.einsum("...ij,...j->...i", np.linalg.inv(camera.K), np.concatenate([pixels, np.ones((5, 1))], -1))
@@ -72,7 +72,7 @@ def test_a_resized_camera_sees_the_same():
 
 
 @pytest.mark.parametrize("wanted", [(32, 24), (16, 12), (40, 12), (7, 30), (1, 1)])
-def test_a_reframed_camera_sees_a_part_of_the_same_undistorted(wanted):
+def test_a_reframed_camera_sees_a_central_part_undistorted(wanted):
     camera, size = select_camera(cameras(CENTRES), 2), (16, 12)
     K = reframe(camera, size, wanted).K
     factor = max(wanted[0] / size[0], wanted[1] / size[1])

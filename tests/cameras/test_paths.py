@@ -1,4 +1,4 @@
-"""Paths through space and time."""
+"""Camera paths through space and time."""
 
 import numpy as np
 import pytest
@@ -46,10 +46,10 @@ def test_path_has_valid_cameras_and_time_runs_once(frames):
 def test_path_first_moves_through_space_alone_then_follows_the_trained_views():
     cameras = walk()
     path = space_time_path(cameras, 96)
-    still = path.time == 0
-    assert 20 < still.sum() < 30
+    at_first_instant = path.time == 0
+    assert 20 < at_first_instant.sum() < 30
     centres = centres_of(path)
-    assert np.ptp(centres[still], axis=0).max() > 0.01
+    assert np.ptp(centres[at_first_instant], axis=0).max() > 0.01
     trained = centres_of(cameras)
     size = np.ptp(trained, axis=0).max()
     nearest = np.linalg.norm(centres[:, None] - trained[None], axis=-1).min(1)
@@ -65,13 +65,13 @@ def test_path_does_not_depend_on_the_order_of_the_views():
         np.testing.assert_allclose(a, b, atol=1e-5)
 
 
-def test_path_smooths_the_shake_of_the_hand():
+def test_path_smooths_camera_shake():
     cameras = walk(frames=100, jitter=0.02)
     shake = lambda centres: np.abs(np.diff(centres, n=2, axis=0)).mean()
     assert shake(centres_of(space_time_path(cameras, 100))) < 0.2 * shake(centres_of(cameras))
 
 
-def test_path_stays_near_one_view_where_the_views_jump_about():
+def test_path_stays_near_one_view_if_consecutive_views_are_far_apart():
     rng = np.random.default_rng(0)
     directions = rng.normal(size=(60, 3))
     directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
@@ -89,14 +89,14 @@ def test_path_stays_near_one_view_where_the_views_jump_about():
     np.testing.assert_allclose(path.viewmat[:, :3, :3], np.tile(rotations[nearest], (48, 1, 1)), atol=1e-6)
 
 
-def test_path_of_a_camera_that_stands_still():
+def test_path_of_a_static_camera_is_static():
     cameras = Camera(np.tile(np.eye(4), (5, 1, 1)), np.tile(np.eye(3), (5, 1, 1)), np.linspace(0, 1, 5))
     path = space_time_path(cameras, 12)
     np.testing.assert_allclose(path.viewmat, np.tile(np.eye(4), (12, 1, 1)), atol=1e-12)
 
 
 def watching(centres, target, up=(0.0, 0, 1)):
-    """Cameras that look at a point, in the order of their instants."""
+    """Cameras that look at a point, in order of time."""
     centres = np.asarray(centres, float)
     forward = (target - centres) / np.linalg.norm(target - centres, axis=-1, keepdims=True)
     right = np.cross(forward, up)
@@ -122,7 +122,7 @@ every_rig = pytest.mark.parametrize("cameras", [AROUND, IN_FRONT, TRIPOD], ids=[
 
 @every_rig
 @pytest.mark.parametrize("path", [spiral, orbit])
-def test_a_flight_keeps_its_distance_and_what_is_looked_at_in_the_middle(cameras, path):
+def test_a_flight_keeps_its_distance_and_its_target_centred(cameras, path):
     times = np.linspace(0.2, 0.7, 25)
     flight = path(cameras, DEPTH, times)
     np.testing.assert_allclose(flight.time, times)
@@ -137,7 +137,7 @@ def test_a_flight_keeps_its_distance_and_what_is_looked_at_in_the_middle(cameras
 
 
 @pytest.mark.parametrize(("cameras", "first", "last"), [(AROUND, -np.pi, np.pi), (IN_FRONT, -0.4, 0.6)])
-def test_an_orbit_goes_around_only_where_the_views_do(cameras, first, last):
+def test_an_orbit_covers_the_angles_of_the_views_only(cameras, first, last):
     level = camera_centres(orbit(cameras, DEPTH, np.linspace(0, 1, 101)).viewmat) - TARGET
     angles = np.arctan2(level[:, 1], level[:, 0])
     np.testing.assert_allclose([angles.min(), angles.max()], [first, last], atol=0.07)
@@ -148,7 +148,7 @@ def test_an_orbit_goes_around_only_where_the_views_do(cameras, first, last):
 @pytest.mark.parametrize(
     "path", [spiral, orbit, lambda cameras, depth, times: interpolate(cameras, times)], ids=["spiral", "orbit", "inter"]
 )
-def test_a_path_moves_with_the_world(cameras, path):
+def test_paths_follow_rotation_shift_and_scale_of_the_world(cameras, path):
     turn, shift, scale = Rotation.from_rotvec([0.3, -1.1, 0.6]).as_matrix(), np.array([5.0, -2, 1]), 7.0
     times = np.linspace(0, 1, 9)
 
@@ -158,11 +158,11 @@ def test_a_path_moves_with_the_world(cameras, path):
         new[:, :3, 3] = scale * viewmat[:, :3, 3] - new[:, :3, :3] @ shift
         return new
 
-    there = path(cameras._replace(viewmat=moved(cameras.viewmat)), scale * DEPTH, times)
-    np.testing.assert_allclose(there.viewmat, moved(path(cameras, DEPTH, times).viewmat), atol=1e-8)
+    transformed = path(cameras._replace(viewmat=moved(cameras.viewmat)), scale * DEPTH, times)
+    np.testing.assert_allclose(transformed.viewmat, moved(path(cameras, DEPTH, times).viewmat), atol=1e-8)
 
 
-def test_the_centre_of_attention_is_where_the_axes_meet_or_else_as_far_as_the_scene():
+def test_the_centre_of_attention_is_where_the_axes_meet_or_at_the_depth_of_the_scene():
     np.testing.assert_allclose(centre_of_attention(AROUND, 0.9 * DEPTH), TARGET, atol=0.1)
     np.testing.assert_allclose(centre_of_attention(TRIPOD, DEPTH), TARGET, atol=1e-9)
     side_by_side = Camera(np.tile(np.eye(4), (5, 1, 1)), np.tile(np.eye(3), (5, 1, 1)), np.linspace(0, 1, 5))
@@ -170,7 +170,7 @@ def test_the_centre_of_attention_is_where_the_axes_meet_or_else_as_far_as_the_sc
     np.testing.assert_allclose(centre_of_attention(side_by_side, 3.0), [0, 0, 3], atol=1e-9)
 
 
-def test_all_in_one_row_or_overhead_still_makes_an_orbit():
+def test_cameras_in_a_row_overhead_have_a_finite_orbit():
     above = watching([[0.01 * i, 0, 4] for i in range(5)], np.zeros(3), up=(0.0, 1, 0))
     path = orbit(above, 4.0, np.linspace(0, 1, 7))
     assert np.isfinite(path.viewmat).all()

@@ -1,4 +1,4 @@
-"""Every layout: a scene written in it reads the same, and all layouts mean the same cameras."""
+"""Every layout: a scene written in it is read back the same, and all layouts agree on cameras."""
 
 import dataclasses
 import json
@@ -30,7 +30,7 @@ def to_bytes(values):
 
 
 def assert_same(a, b):
-    """Equal but for the rounding of the pictures to 8 bits."""
+    """Equal except for the rounding of pictures to 8 bits."""
     assert (a.width, a.height) == (b.width, b.height)
     np.testing.assert_array_equal(a.points, b.points)
     np.testing.assert_array_equal(a.colors, b.colors)
@@ -77,7 +77,7 @@ def make_dataset(seed, frames, centred=False):
 
 
 @pytest.mark.parametrize("layout", data.LAYOUTS)
-def test_any_scene_survives_any_layout(tmp_path_factory, layout):
+def test_any_scene_is_read_back_from_any_layout(tmp_path_factory, layout):
     @PROPERTY
     @given(**SCENES)
     def check(seed, frames):
@@ -90,7 +90,7 @@ def test_any_scene_survives_any_layout(tmp_path_factory, layout):
 
 
 def part(split, chosen):
-    """A few frames of a split, with masks of what enough views have seen."""
+    """The chosen frames of a split, with random covisibility masks."""
     pick = lambda x: None if x is None else x[chosen]
     return dataclasses.replace(
         split,
@@ -104,25 +104,25 @@ def part(split, chosen):
 
 
 @pytest.mark.parametrize("layout", data.LAYOUTS)
-def test_instants_of_part_of_a_scene_and_its_truth_and_masks_survive(tmp_path, layout):
+def test_instants_truth_and_masks_of_part_of_a_scene_are_read_back(tmp_path, layout):
     dataset = data.load_dataset(write_nerfies(tmp_path / "scene", truth=True))
-    some = dataclasses.replace(dataset, train=part(dataset.train, [1, 2, 4]), test=part(dataset.test, [1]))
-    assert some.train.cameras.time.min() > 0
-    data.LAYOUTS[layout].write(some, tmp_path / "copy")
-    assert_same(data.load_dataset(tmp_path / "copy"), some)
+    subset = dataclasses.replace(dataset, train=part(dataset.train, [1, 2, 4]), test=part(dataset.test, [1]))
+    assert subset.train.cameras.time.min() > 0
+    data.LAYOUTS[layout].write(subset, tmp_path / "copy")
+    assert_same(data.load_dataset(tmp_path / "copy"), subset)
     data.LAYOUTS[layout].write(data.load_dataset(tmp_path / "copy"), tmp_path / "again")
-    assert_same(data.load_dataset(tmp_path / "again"), some)
+    assert_same(data.load_dataset(tmp_path / "again"), subset)
 
 
 @pytest.mark.parametrize("layout", ["nerfies", "colmap", "llff"])
-def test_pixels_that_do_not_count_survive(tmp_path, layout):
+def test_invalid_pixels_are_read_back(tmp_path, layout):
     dataset = data.load_dataset(write_nerfies(tmp_path / "scene"))
     valid = np.random.default_rng(0).random(dataset.train.images.shape[:3]) < 0.8
-    some = dataclasses.replace(dataset, train=dataclasses.replace(dataset.train, valid=valid))
-    data.LAYOUTS[layout].write(some, tmp_path / "copy")
-    assert_same(data.load_dataset(tmp_path / "copy"), some)
+    with_invalid = dataclasses.replace(dataset, train=dataclasses.replace(dataset.train, valid=valid))
+    data.LAYOUTS[layout].write(with_invalid, tmp_path / "copy")
+    assert_same(data.load_dataset(tmp_path / "copy"), with_invalid)
     with pytest.raises(UserError, match="--to transforms: some pixels of the scene are not valid; expected"):
-        data.LAYOUTS["transforms"].write(some, tmp_path / "other")
+        data.LAYOUTS["transforms"].write(with_invalid, tmp_path / "other")
 
 
 def set_lens(layout, folder, k, p, size):
@@ -134,16 +134,16 @@ def set_lens(layout, folder, k, p, size):
     elif layout == "transforms":
         edit_json(folder / "transforms.json", **dict(zip(("k1", "k2", "k3", "p1", "p2"), (*k, *p), strict=True)))
     else:
-        place = folder / "sparse" / "0"
-        cameras = list(colmap_model.read_cameras(place).values())
+        model_folder = folder / "sparse" / "0"
+        cameras = list(colmap_model.read_cameras(model_folder).values())
         lens = [
             ModelCamera("FULL_OPENCV", width, height, (*c.params, *k[:2], *p, k[2], 0.0, 0.0, 0.0)) for c in cameras
         ]
-        images, cloud = colmap_model.read_images(place), colmap_model.read_points(place)
-        for path in place.iterdir():
+        images, cloud = colmap_model.read_images(model_folder), colmap_model.read_points(model_folder)
+        for path in model_folder.iterdir():
             path.unlink()
-        place.rmdir()
-        colmap_model.write_model(place, lens, images, *cloud)
+        model_folder.rmdir()
+        colmap_model.write_model(model_folder, lens, images, *cloud)
 
 
 def blank(dataset):
@@ -175,7 +175,7 @@ def test_all_layouts_undo_the_same_lens_alike(tmp_path_factory):
 
 
 @pytest.mark.parametrize("layout", data.LAYOUTS)
-def test_nothing_is_written_over_files_or_half(tmp_path, monkeypatch, layout):
+def test_no_files_are_overwritten_and_no_partial_copy_is_left(tmp_path, monkeypatch, layout):
     def fill_the_disk(*_):
         raise OSError(28, "No space left on device")
 
@@ -195,7 +195,7 @@ def test_a_camera_that_llff_cannot_describe_is_refused(tmp_path):
     assert not (tmp_path / "copy").exists()
 
 
-def test_the_command_line_converts_and_says_so(tmp_path, capsys):
+def test_the_command_converts_and_reports(tmp_path, capsys):
     scene = write_nerfies(tmp_path / "a scene é", truth=True)
     arguments = [str(scene), str(tmp_path / "out"), "--to", "colmap", "--downscale", "2", "--held-out", "4"]
     convert.main(arguments)
@@ -206,7 +206,7 @@ def test_the_command_line_converts_and_says_so(tmp_path, capsys):
     assert json.loads((tmp_path / "out" / "dataset.json").read_text())["val_ids"] == ["000000", "000004"]
 
 
-def test_a_mistake_on_the_command_line_is_one_sentence(tmp_path, capsys, monkeypatch):
+def test_a_mistake_on_the_command_line_is_reported_in_one_sentence(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(command_line, "use_compilation_cache", lambda: None)
     for arguments, message in (
         ([str(tmp_path / "none"), str(tmp_path / "out"), "--to", "llff"], "none: no such folder"),

@@ -14,21 +14,21 @@ def run(*arguments):
     return subprocess.run([sys.executable, *arguments], capture_output=True, text=True)
 
 
-def test_the_list_of_commands():
+def test_help_lists_the_commands():
     done = run("-m", "l2dgs_jax", "--help")
     assert done.returncode == 0
     assert all(f"\n  {name} " in done.stdout for name in COMMANDS)
     assert run("-m", "l2dgs_jax").stdout == done.stdout
 
 
-def test_an_unknown_command_is_one_sentence():
+def test_an_unknown_command_is_refused_in_one_sentence():
     done = run("-m", "l2dgs_jax", "trian")
     assert done.returncode == 2
     assert done.stderr.startswith("error: trian: no such command; expected one of train, evaluate")
     assert done.stderr.count("\n") == 1
 
 
-def test_both_ways_to_a_command_do_the_same(tmp_path):
+def test_both_ways_to_call_a_command_do_the_same(tmp_path):
     for name, way in (("a", ["l2dgs_jax.convert"]), ("b", ["l2dgs_jax", "convert"])):
         done = run("-m", *way, "demo", str(tmp_path / name), "--to", "transforms")
         assert done.returncode == 0, done.stderr
@@ -38,7 +38,7 @@ def test_both_ways_to_a_command_do_the_same(tmp_path):
 
 
 @pytest.mark.parametrize("way", [["l2dgs_jax.convert"], ["l2dgs_jax", "convert"]], ids=["module", "script"])
-def test_a_mistake_is_one_sentence_either_way(way, tmp_path):
+def test_a_mistake_is_reported_in_one_sentence_either_way(way, tmp_path):
     done = run("-m", *way, str(tmp_path / "nonsuch"), str(tmp_path / "out"), "--to", "llff")
     assert done.returncode == 2
     assert done.stderr.startswith("error: ")
@@ -50,7 +50,7 @@ def test_help_names_the_program_that_was_called():
     assert "usage: python -m l2dgs_jax.convert" in run("-m", "l2dgs_jax.convert", "--help").stdout
 
 
-def test_a_warning_is_one_sentence(capsys):
+def test_a_warning_is_printed_as_one_sentence(capsys):
     def command(arguments):
         warnings.simplefilter("default")
         warnings.warn("it is slow", RuntimeWarning, stacklevel=1)

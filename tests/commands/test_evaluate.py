@@ -1,4 +1,4 @@
-"""Scores of a run against plain NumPy and scikit-image, and the command that prints them."""
+"""Scores of a run compared with plain NumPy and scikit-image, and the command that prints them."""
 
 import dataclasses
 import json
@@ -66,7 +66,7 @@ def psnr(prediction, truth, masks=None):
 
 
 def ssim(prediction, truth, masks=None):
-    """Of windows inside the image, or of those of them around the pixels of a mask."""
+    """Mean over windows inside the image, or over those of them centred on pixels of a mask."""
     scores, inside = [], (slice(5, -5), slice(5, -5))
     for i, (p, t) in enumerate(zip(prediction, truth, strict=True)):
         mean, similarity = structural_similarity(
@@ -84,13 +84,13 @@ def regions(masks):
 
 
 def best_gain(prediction, truth):
-    """By search, saturation included."""
+    """The gain found by search, with saturation."""
     error = lambda gain: np.square(np.clip(gain * prediction, 0, 1) - truth).mean()
     start = np.linalg.lstsq(prediction.reshape(-1, 1), truth.ravel())[0].item()
     return minimize_scalar(error, bounds=(start / 2, start * 2), method="bounded", options={"xatol": 1e-6}).x
 
 
-def test_counts(result, run):
+def test_counts_of_frames_steps_and_gaussians(result, run):
     assert result["frames"] == len(finished_run.HELD_OUT)
     assert (result["split"], result["stage"], result["step"]) == ("test", "fine", 6)
     assert result["gaussians"] == int(np.sum(run.state.scene.alive))
@@ -102,7 +102,7 @@ def test_frames_in_a_file_score_the_same(run, result):
     assert evaluate(dataclasses.replace(run, dataset=load_dataset(scene, frame_memory=0.0))) == result
 
 
-def test_lowlight_scores_are_scikit_images(result, rendered):
+def test_lowlight_scores_match_scikit_image(result, rendered):
     for region, masks in regions(rendered["masks"]).items():
         scores = result["lowlight"] if region == "overall" else result["lowlight_regions"][region]
         assert set(scores) == {"psnr", "ssim", "area"}
@@ -121,7 +121,7 @@ def test_a_scene_of_brightened_frames_has_no_low_light_score(run, result):
     assert "low light" not in table(scores)
 
 
-def test_of_drifting_exposures_each_frame_is_scored_after_its_own_gain(run, result, rendered):
+def test_with_drifting_exposures_each_low_light_frame_is_scored_with_its_own_gain(run, result, rendered):
     assert result["lowlight_gain"] == "none"
     params = run.state.scene.params._replace(exposures=np.zeros((len(run.dataset.train.names), 3), np.float32))
     drifting = dataclasses.replace(run, state=run.state._replace(scene=run.state.scene._replace(params=params)))
@@ -135,7 +135,7 @@ def test_of_drifting_exposures_each_frame_is_scored_after_its_own_gain(run, resu
     assert scores["welllit"] == result["welllit"]
 
 
-def test_welllit_scores_are_scikit_images(result, rendered):
+def test_welllit_scores_match_scikit_image(result, rendered):
     gain = best_gain(rendered["welllit"], rendered["truth"])
     np.testing.assert_allclose(result["gain"], gain, rtol=1e-3)
     gained = np.clip(gain * rendered["welllit"], 0, 1)
@@ -148,7 +148,7 @@ def test_welllit_scores_are_scikit_images(result, rendered):
     assert result["welllit"]["overall"]["psnr_gain"] >= result["welllit"]["overall"]["psnr"] - 0.1
 
 
-def test_scores_beyond_these_are_there_or_null(result, rendered):
+def test_further_scores_are_present_or_null(result, rendered):
     overall = result["welllit"]["overall"]
     found = np.mean([flip_map(p, t).mean() for p, t in zip(rendered["welllit"], rendered["truth"], strict=True)])
     np.testing.assert_allclose(overall["flip"], found, atol=1e-3)
@@ -158,7 +158,7 @@ def test_scores_beyond_these_are_there_or_null(result, rendered):
     assert "LPIPS needs weights" in table(result)
 
 
-def test_lpips_in_the_papers_convention_is_shared_out_by_area(run, monkeypatch, tmp_path):
+def test_lpips_of_a_region_in_the_papers_convention_is_proportional_to_its_area(run, monkeypatch, tmp_path):
     monkeypatch.setitem(metrics.NETWORKS, "alex", networks.TINY)
     monkeypatch.setitem(SMALLEST_SIDE, "alex", 1)
     np.savez(tmp_path / "tiny.npz", **networks.state_dict("alex"))
@@ -172,7 +172,7 @@ def test_lpips_in_the_papers_convention_is_shared_out_by_area(run, monkeypatch, 
     assert "LPIPS needs weights" not in table(found)
 
 
-def test_dark_frame_times_its_best_gain(result, rendered):
+def test_the_dark_frame_is_scored_with_its_best_gain(result, rendered):
     gain = best_gain(rendered["input"], rendered["truth"])
     assert gain > 3
     gained = np.clip(gain * rendered["input"], 0, 1)
@@ -193,12 +193,12 @@ def test_without_truth_or_masks_only_the_low_light_is_scored(run):
     assert "welllit" not in result
 
 
-def test_split_without_views(run):
+def test_a_split_without_views_is_refused(run):
     with pytest.raises(UserError, match="has no test views; expected some, or --split train"):
         evaluate(finished_run.without_truth_and_test(run))
 
 
-def test_table_shows_every_score(result):
+def test_the_table_shows_every_score(result):
     lines = table(result).splitlines()
     assert lines[0] == "2 test views, fine stage, step 6"
     overall = next(line for line in lines if line.startswith("well-lit")).split()[1:]
@@ -216,8 +216,8 @@ def test_table_shows_every_score(result):
     assert sum(line.startswith("  dynamic") for line in lines) == 2
 
 
-def test_command_writes_what_evaluate_returns(base, result, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("l2dgs_jax.evaluate.find_lpips", lambda files: {})  # whatever is installed
+def test_the_command_writes_what_evaluate_returns(base, result, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("l2dgs_jax.evaluate.find_lpips", lambda files: {})  # even if weights are installed
     file = tmp_path / "scores.json"
     file.write_text("old")
     command_line.run(main, [str(finished_run.folder(base)), "--json", str(file)])
@@ -226,7 +226,7 @@ def test_command_writes_what_evaluate_returns(base, result, tmp_path, capsys, mo
     assert capsys.readouterr().out.strip() == table(result)
 
 
-def test_command_scores_the_coarse_stage_and_the_training_views(base, result, tmp_path, capsys):
+def test_the_command_scores_the_coarse_stage_and_the_training_views(base, result, tmp_path, capsys):
     run_folder = str(finished_run.folder(base))
     command_line.run(
         main, [run_folder, "--stage", "coarse", "--split", "train", "--json", str(tmp_path / "coarse.json")]
@@ -238,7 +238,7 @@ def test_command_scores_the_coarse_stage_and_the_training_views(base, result, tm
     assert "8 train views, coarse stage, step 3" in capsys.readouterr().out
 
 
-def test_a_process_of_its_own_in_single_precision_finds_the_same(base, result, tmp_path):
+def test_a_separate_process_in_single_precision_gives_the_same_scores(base, result, tmp_path):
     file = tmp_path / "scores.json"
     command = [sys.executable, "-m", "l2dgs_jax.evaluate", str(finished_run.folder(base)), "--json", str(file)]
     done = subprocess.run(command, capture_output=True, text=True, check=True, env=os.environ | {"JAX_ENABLE_X64": "0"})
@@ -268,27 +268,27 @@ def test_a_process_of_its_own_in_single_precision_finds_the_same(base, result, t
         ),
     ],
 )
-def test_bad_input_is_one_sentence_and_exit_code_2(base, tmp_path, capsys, arguments, message):
+def test_invalid_input_gives_one_sentence_and_exit_2(base, tmp_path, capsys, arguments, message):
     (tmp_path / "empty").mkdir()
-    places = {"missing": tmp_path / "missing", "empty": tmp_path / "empty", "run": finished_run.folder(base)}
-    with pytest.raises(SystemExit) as leave:
-        command_line.run(main, [argument.format(**places) for argument in arguments])
-    assert leave.value.code == 2
+    paths = {"missing": tmp_path / "missing", "empty": tmp_path / "empty", "run": finished_run.folder(base)}
+    with pytest.raises(SystemExit) as caught:
+        command_line.run(main, [argument.format(**paths) for argument in arguments])
+    assert caught.value.code == 2
     error = capsys.readouterr().err
     assert message in error
     assert len(error.strip().splitlines()) == 1
 
 
-def test_run_without_a_coarse_checkpoint(base, tmp_path, capsys):
+def test_a_run_without_a_coarse_checkpoint_is_refused(base, tmp_path, capsys):
     scene, config = runs.read_settings(finished_run.folder(base))
     runs.write_settings(tmp_path / "young", scene, config)
-    with pytest.raises(SystemExit) as leave:
+    with pytest.raises(SystemExit) as caught:
         command_line.run(main, [str(tmp_path / "young"), "--stage", "coarse"])
-    assert leave.value.code == 2
+    assert caught.value.code == 2
     assert "coarse.npz: no such checkpoint; expected a run that has got that far" in capsys.readouterr().err
 
 
-def test_pixels_that_do_not_count_are_left_out_and_covisible_ones_scored(run, result, rendered):
+def test_invalid_pixels_are_ignored_and_covisible_ones_scored(run, result, rendered):
     split = run.dataset.test
     rng = np.random.default_rng(0)
     valid, seen = (rng.random(split.masks.shape) < share for share in (0.8, 0.5))
@@ -300,7 +300,7 @@ def test_pixels_that_do_not_count_are_left_out_and_covisible_ones_scored(run, re
         )
         results.append(evaluate(dataclasses.replace(run, dataset=dataclasses.replace(run.dataset, test=test))))
     flowless = [{key: scores for key, scores in found.items() if key != "temporal"} for found in results]
-    assert flowless[0] == flowless[1]  # flow looks at all pixels
+    assert flowless[0] == flowless[1]  # optical flow uses all pixels
     found = results[0]
     assert found["lowlight_regions"].keys() == {"dynamic", "static", "covisible"}
     assert found["welllit"].keys() == {"overall", "dynamic", "static", "covisible"}
@@ -314,7 +314,7 @@ def test_pixels_that_do_not_count_are_left_out_and_covisible_ones_scored(run, re
     assert "covisible" not in table(result)
 
 
-def test_a_frame_that_is_not_finite_is_named_and_leaves_no_mean(run, result, monkeypatch):
+def test_a_frame_with_nan_is_named_and_means_are_null(run, result, monkeypatch):
     def spoiled(*arguments):
         for index, output in enumerate(views(*arguments)):
             images = output.images
@@ -334,7 +334,7 @@ def test_a_frame_that_is_not_finite_is_named_and_leaves_no_mean(run, result, mon
     assert "gain unknown" in table(found)
 
 
-def test_a_split_in_which_no_pixel_counts_is_refused(run):
+def test_a_split_without_valid_pixels_is_refused(run):
     test = dataclasses.replace(run.dataset.test, valid=np.zeros(run.dataset.test.masks.shape, bool))
     with pytest.raises(UserError, match="no pixel of its scene's test views is valid; expected"):
         evaluate(dataclasses.replace(run, dataset=dataclasses.replace(run.dataset, test=test)))

@@ -1,4 +1,4 @@
-"""The command that writes a run for other programs."""
+"""The command that writes a run in the formats of other programs."""
 
 import dataclasses
 import json
@@ -32,7 +32,7 @@ def run_folder(tmp_path_factory):
 
 @pytest.fixture
 def baked_times(monkeypatch):
-    """In place of baking, which has its own tests: three Gaussians that move by the instant, one of them invisible."""
+    """The instants that are baked. Baking, which has its own tests, is replaced: three Gaussians, one invisible."""
     times = []
 
     def bake(run, instants, brightest, images=("welllit",)):
@@ -65,7 +65,7 @@ def test_one_instant_goes_to_one_file(run_folder, baked_times, tmp_path, capsys,
     assert ("30.25 dB" in output) == (format != "cloud")
 
 
-def test_many_instants_go_to_a_folder_that_counts_them(run_folder, baked_times, tmp_path, capsys):
+def test_many_instants_go_to_numbered_files_of_a_folder(run_folder, baked_times, tmp_path, capsys):
     run_command(run_folder, "--to", "cloud", "--times", 5, "--output", tmp_path / "frames")
     assert baked_times == [0, 0.25, 0.5, 0.75, 1]
     files = sorted((tmp_path / "frames").iterdir())
@@ -76,7 +76,7 @@ def test_many_instants_go_to_a_folder_that_counts_them(run_folder, baked_times, 
     assert f"wrote 5 files of 2 visible Gaussians, of 3 in all, to {tmp_path / 'frames'}" in capsys.readouterr().out
 
 
-def test_files_go_to_the_runs_folder_unless_told_otherwise(run_folder, baked_times):
+def test_files_go_to_the_folder_of_the_run_by_default(run_folder, baked_times):
     run_command(run_folder, "--to", "splat")
     run_command(run_folder, "--to", "splat", "--times", 1)
     assert baked_times == [0.5, 0]
@@ -94,12 +94,12 @@ def test_a_page_covers_all_instants(run_folder, baked_times, tmp_path, capsys):
     assert "exact low-light images: 30.25 to 30.75 dB" in output
 
 
-def test_a_page_has_an_instant_for_every_frame_and_no_more_than_needed(run_folder, baked_times, tmp_path):
+def test_a_page_has_one_instant_for_every_frame_by_default(run_folder, baked_times, tmp_path):
     run_command(run_folder, "--to", "html", "--output", tmp_path / "page.html")
     assert len(baked_times) == finished_run.FRAMES
 
 
-def test_frames_of_several_cameras_at_an_instant_are_one_of_a_page(run_folder, baked_times, tmp_path, monkeypatch):
+def test_frames_of_several_cameras_at_one_instant_count_once_in_a_page(run_folder, baked_times, tmp_path, monkeypatch):
     run = open_run(run_folder)
     test = dataclasses.replace(run.dataset.test, cameras=jax.tree.map(lambda x: x[[1, 4]], run.dataset.train.cameras))
     both = dataclasses.replace(run, dataset=dataclasses.replace(run.dataset, test=test))
@@ -108,21 +108,21 @@ def test_frames_of_several_cameras_at_an_instant_are_one_of_a_page(run_folder, b
     assert len(baked_times) == len(run.dataset.train.names)
 
 
-def test_a_page_of_nothing_is_not_written(run_folder, baked_times, tmp_path, monkeypatch, capsys):
-    canned = export.bake
-    gone = lambda splats: splats._replace(opacities=0 * splats.opacities)
-    monkeypatch.setattr(export, "bake", lambda *arguments: (tuple(map(gone, pair)) for pair in canned(*arguments)))
+def test_a_page_without_visible_gaussians_is_not_written(run_folder, baked_times, tmp_path, monkeypatch, capsys):
+    fake = export.bake
+    invisible = lambda splats: splats._replace(opacities=0 * splats.opacities)
+    monkeypatch.setattr(export, "bake", lambda *arguments: (tuple(map(invisible, pair)) for pair in fake(*arguments)))
     with pytest.raises(SystemExit):
         run_command(run_folder, "--to", "html", "--times", 2, "--output", tmp_path / "page.html")
     assert "nothing is visible; expected a trained scene" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 
 
-def test_a_sequence_that_fails_leaves_nothing(run_folder, baked_times, tmp_path, monkeypatch, capsys):
-    canned = export.bake
+def test_a_sequence_that_fails_leaves_no_files(run_folder, baked_times, tmp_path, monkeypatch, capsys):
+    fake = export.bake
 
     def faint(run, times, brightest):
-        for (splats,), time in zip(canned(run, times, brightest), times, strict=True):
+        for (splats,), time in zip(fake(run, times, brightest), times, strict=True):
             yield (splats._replace(opacities=splats.opacities * (time < 0.6)),)
 
     monkeypatch.setattr(export, "bake", faint)
@@ -132,7 +132,7 @@ def test_a_sequence_that_fails_leaves_nothing(run_folder, baked_times, tmp_path,
     assert not list(tmp_path.iterdir())
 
 
-def test_cameras_and_the_model(run_folder, tmp_path, capsys):
+def test_cameras_and_the_model_are_exported(run_folder, tmp_path, capsys):
     run = finished_run.opened(run_folder.parent)
     run_command(run_folder, "--to", "cameras", "--split", "test", "--fps", 4, "--output", tmp_path / "path.json")
     path = json.loads((tmp_path / "path.json").read_text())
@@ -166,11 +166,11 @@ def test_cameras_and_the_model(run_folder, tmp_path, capsys):
         (["--to", "ply", "--output", "{full}/note.txt/x.ply"], "expected a writable place"),
     ],
 )
-def test_bad_input_is_one_sentence_and_exit_code_2(run_folder, baked_times, tmp_path, capsys, arguments, message):
+def test_invalid_input_gives_one_sentence_and_exit_2(run_folder, baked_times, tmp_path, capsys, arguments, message):
     (tmp_path / "note.txt").write_text("")
-    with pytest.raises(SystemExit) as leave:
+    with pytest.raises(SystemExit) as caught:
         run_command(run_folder, *(argument.format(full=tmp_path) for argument in arguments))
-    assert leave.value.code == 2
+    assert caught.value.code == 2
     error = capsys.readouterr().err
     assert message in error
     assert len([line for line in error.splitlines() if line.startswith("error: ")]) == 1
@@ -179,8 +179,8 @@ def test_bad_input_is_one_sentence_and_exit_code_2(run_folder, baked_times, tmp_
 
 
 @pytest.mark.slow
-def test_the_whole_way(run_folder, tmp_path):
-    """Baking included, in a process of its own, where floats have single precision."""
+def test_a_separate_process_bakes_and_exports(run_folder, tmp_path):
+    """In that process, floats have single precision."""
     command = [sys.executable, "-m", "l2dgs_jax.export", str(run_folder), "--to", "ply", "--times", "2"]
     done = subprocess.run([*command, "--output", str(tmp_path / "ply")], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

@@ -1,4 +1,4 @@
-"""The command that writes masks of what moves into a scene."""
+"""The command that writes motion masks into a scene."""
 
 import os
 import shutil
@@ -50,10 +50,10 @@ def files(folder):
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-def failure(capsys, arguments):
-    with pytest.raises(SystemExit) as leave:
+def error_of(capsys, arguments):
+    with pytest.raises(SystemExit) as caught:
         command_line.run(masks.main, [str(argument) for argument in arguments])
-    assert leave.value.code == 2
+    assert caught.value.code == 2
     lines = capsys.readouterr().err.strip().splitlines()
     assert lines[-1].startswith("error: ")
     assert not any("Traceback" in line for line in lines)
@@ -90,7 +90,7 @@ def test_frames_in_a_file_give_the_same_masks(scene):
 
 
 @pytest.mark.parametrize("lens", [Lens(), Lens((-0.3, 0.1), tangential=(0.01, -0.02)), Lens((0.05,), fisheye=True)])
-def test_masks_are_bent_as_the_lens_bends_the_pictures(lens):
+def test_masks_are_distorted_by_the_lens_like_the_pictures(lens):
     width, height, downscale = 161, 122, 2
     K = np.array([[100.0, 0, 83], [0, 105, 60], [0, 0, 1]])
     rows, columns = np.mgrid[: height // downscale, : width // downscale]
@@ -102,21 +102,21 @@ def test_masks_are_bent_as_the_lens_bends_the_pictures(lens):
     assert (read_back & mask).sum() / (read_back | mask).sum() > 0.95
 
 
-def test_masks_that_exist_stay_unless_told_otherwise(scene, capsys):
+def test_existing_masks_are_kept_without_overwrite(scene, capsys):
     for name in files(scene / "rgb" / "1x"):
         write_image(scene / "mask" / "1x" / name, np.zeros((HEIGHT, WIDTH)))
     before = files(scene)
     message = "mask: holds masks of this scene; expected none, or --overwrite to replace them"
     for downscale in (1, 2):  # half-size masks would hide the given ones at half size
-        assert message in failure(capsys, [scene, "--downscale", downscale])
+        assert message in error_of(capsys, [scene, "--downscale", downscale])
         assert files(scene) == before
     shutil.copytree(scene / "mask" / "1x", scene / "mask" / "2x")
     command_line.run(masks.main, [str(scene), "--overwrite"])
-    assert files(scene).keys() == before.keys()  # those of another size are gone: they would be preferred to the new
+    assert files(scene).keys() == before.keys()  # masks of another size are removed: readers would prefer them
     assert data.load_dataset(scene).train.masks.any()
 
 
-def test_names_may_have_folders_spaces_and_other_scripts(tmp_path):
+def test_frame_names_may_have_folders_spaces_and_other_scripts(tmp_path):
     names = ["left/a b", "right/日本"]
     (tmp_path / "mask" / "1x").mkdir(parents=True)
     (tmp_path / "mask" / "1x" / "older.png").write_text("")
@@ -143,23 +143,23 @@ def test_a_failure_midway_leaves_the_scene_as_it_was(scene, monkeypatch):
     assert sorted(path.name for path in scene.iterdir()) == ["camera", "dataset.json", "mask", "points.npy", "rgb"]
 
 
-def test_bad_input_is_one_sentence_before_any_work(scene, tmp_path, capsys, monkeypatch):
+def test_invalid_input_gives_one_sentence_before_any_work(scene, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(masks, "compute_masks", lambda dataset: pytest.fail("too late"))
-    assert "no such folder" in failure(capsys, [tmp_path / "missing"])
-    assert "expected a file in an existing folder" in failure(capsys, [scene, "--preview", tmp_path / "no" / "x.png"])
+    assert "no such folder" in error_of(capsys, [tmp_path / "missing"])
+    assert "expected a file in an existing folder" in error_of(capsys, [scene, "--preview", tmp_path / "no" / "x.png"])
     monkeypatch.setattr(os, "access", lambda path, mode: False)
-    assert "cannot be written; expected a writable folder" in failure(capsys, [scene])
+    assert "cannot be written; expected a writable folder" in error_of(capsys, [scene])
     monkeypatch.undo()
     (scene / "mask").write_text("")
-    assert "mask: is a file; expected a folder" in failure(capsys, [scene])
+    assert "mask: is a file; expected a folder" in error_of(capsys, [scene])
     assert (scene / "mask").read_text() == ""
 
 
-def test_frames_of_one_instant_are_refused_by_name(scene):
+def test_a_scene_of_a_single_instant_is_refused_by_name(scene):
     dataset = data.load_dataset(scene)
-    still = lambda split: split.__class__(
+    frozen = lambda split: split.__class__(
         split.names, split.cameras._replace(time=0 * split.cameras.time), split.images
     )
-    parts = (dataset.width, dataset.height, still(dataset.train), still(dataset.test), dataset.points)
+    parts = (dataset.width, dataset.height, frozen(dataset.train), frozen(dataset.test), dataset.points)
     with pytest.raises(UserError, match="quiet: all frames are of one instant"):
         compute_masks(Dataset("quiet", *parts))

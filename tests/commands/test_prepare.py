@@ -19,7 +19,7 @@ COUNT = 10
 
 @pytest.fixture(scope="module")
 def source(tmp_path_factory):
-    """A folder of dark frames in which a square moves, and the cameras."""
+    """A folder of dark frames in which a square moves, and their cameras."""
     folder = tmp_path_factory.mktemp("source")
     pictures, views, _ = clips.clip(COUNT, light=0.2)
     for i, picture in enumerate(pictures):
@@ -32,7 +32,7 @@ def run(*arguments):
 
 
 def pose_errors(model, truth):
-    """Median distance of camera centres in parts of the trajectory, and median angle, after a similarity alignment.
+    """Median distance of camera centres over the trajectory's length, and median angle, after similarity alignment.
 
     `truth` maps names to world-to-camera matrices.
     """
@@ -49,7 +49,7 @@ def pose_errors(model, truth):
     return np.median(distances) / length, np.degrees(np.median(np.arccos(np.clip(cosines, -1, 1))))
 
 
-def test_dark_frames_get_poses_also_after_an_interruption(source, tmp_path, monkeypatch, capsys):
+def test_dark_frames_get_poses_even_after_an_interruption(source, tmp_path, monkeypatch, capsys):
     folder, views = source
     output = tmp_path / "a scene – ü"
 
@@ -65,7 +65,7 @@ def test_dark_frames_get_poses_also_after_an_interruption(source, tmp_path, monk
     assert [path.name for path in tmp_path.iterdir()] == [f"{output.name}.partial"]
 
     with monkeypatch.context() as patch:
-        patch.setattr(frames, "scan", interrupt)  # is done already
+        patch.setattr(frames, "scan", interrupt)  # done already: not called again
         run(folder, output)
     assert list(tmp_path.iterdir()) == [output]
     assert f"registered    {COUNT} of {COUNT} frames" in capsys.readouterr().out
@@ -128,7 +128,7 @@ def one_frame(folder):
     return folder / "photo.avi"
 
 
-def file(name, content=b""):
+def other_file(name, content=b""):
     def make(folder):
         (folder / name).write_bytes(content)
         return folder / name
@@ -142,24 +142,24 @@ def pictures(folder):
     return folder / "in"
 
 
-def damaged(folder):
+def damaged_picture(folder):
     path = pictures(folder) / "a 3.png"
     path.write_bytes(path.read_bytes()[:-300])
     return folder / "in"
 
 
-def mixed(folder):
+def mixed_sizes(folder):
     write_image(pictures(folder) / "a 4.png", np.zeros((24, 30, 3)))
     return folder / "in"
 
 
-def taken(folder):
+def existing_output(folder):
     (folder / "out").mkdir()
     (folder / "out" / "mine").write_text("work")
     return pictures(folder)
 
 
-def foreign(folder):
+def partial_output_of_others(folder):
     (folder / "out.partial").mkdir()
     (folder / "out.partial" / "mine").write_text("work")
     return pictures(folder)
@@ -169,15 +169,15 @@ FAULTS = {
     "one frame": ("photo.avi: holds 1 frame(s)", one_frame),
     "tripod": ("tripod.avi: the camera stands still", still_video),
     "turning on the spot": ("pan.avi: 0 of", panning_video),
-    "no video": ("notes.txt: not a video that OpenCV can read", file("notes.txt", b"dark")),
-    "empty video": ("clip.mp4: not a video that OpenCV can read", file("clip.mp4")),
-    "zip": ("frames.zip: not a video that OpenCV can read", file("frames.zip", b"PK\x03\x04" + bytes(100))),
+    "no video": ("notes.txt: not a video that OpenCV can read", other_file("notes.txt", b"dark")),
+    "empty video": ("clip.mp4: not a video that OpenCV can read", other_file("clip.mp4")),
+    "zip": ("frames.zip: not a video that OpenCV can read", other_file("frames.zip", b"PK\x03\x04" + bytes(100))),
     "nothing": ("gone.mp4: no such file or folder", lambda folder: folder / "gone.mp4"),
     "empty folder": ("in: holds no pictures", lambda folder: (folder / "in").mkdir() or folder / "in"),
-    "damaged picture": ("a 3.png: expected a readable picture", damaged),
-    "mixed sizes": ("a 4.png: the picture is 30x24 pixels; expected 32x24 as a 0.png", mixed),
-    "output exists": ("out: exists already", taken),
-    "work of others": ("out.partial: exists, but prepare has not written it", foreign),
+    "damaged picture": ("a 3.png: expected a readable picture", damaged_picture),
+    "mixed sizes": ("a 4.png: the picture is 30x24 pixels; expected 32x24 as a 0.png", mixed_sizes),
+    "output exists": ("out: exists already", existing_output),
+    "work of others": ("out.partial: exists, but prepare has not written it", partial_output_of_others),
 }
 
 
@@ -196,7 +196,7 @@ def test_a_fault_is_named_in_one_sentence_and_nothing_is_written(tmp_path, fault
     assert (tmp_path / "out").exists() == (fault == "output exists")
 
 
-def test_a_place_that_cannot_be_written_is_named(tmp_path):
+def test_an_output_that_cannot_be_written_is_named(tmp_path):
     source = pictures(tmp_path)
     (tmp_path / "file").write_text("")
     with pytest.raises(UserError, match=r"out: cannot be made \(Not a directory\); expected a writable place"):
@@ -204,19 +204,19 @@ def test_a_place_that_cannot_be_written_is_named(tmp_path):
 
 
 @pytest.mark.parametrize("option", [("--frames", "2"), ("--threads", "-1")])
-def test_options_out_of_range(tmp_path, option):
+def test_options_out_of_range_are_refused(tmp_path, option):
     with pytest.raises(UserError, match=f"{' '.join(option)}: expected"):
         prepare.main([str(tmp_path), str(tmp_path / "out"), *option])
 
 
-def test_missing_package_names_the_extra(tmp_path, monkeypatch):
+def test_a_missing_package_is_reported_with_its_extra(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     with pytest.raises(UserError, match=r'pip install "l2dgs-jax\[sfm\]"'):
         run(pictures(tmp_path), tmp_path / "out")
     assert not (tmp_path / "out.partial").exists()
 
 
-def test_other_settings_or_pictures_begin_anew(tmp_path):
+def test_changed_settings_or_pictures_start_over(tmp_path):
     source = pictures(tmp_path)
     open_work = lambda **settings: pipeline._open_work(source, tmp_path / "out", CaptureConfig(**settings))
     work = open_work()
@@ -242,7 +242,7 @@ def test_lens_distortion_is_found(tmp_path, k1):
 
 
 @pytest.mark.slow
-def test_one_thread_gives_the_same_numbers_every_time(source, tmp_path):
+def test_with_one_thread_results_are_reproducible(source, tmp_path):
     for name in ("first", "second"):
         run(source[0], tmp_path / name)
     first, second = ((tmp_path / name / "sparse/0/points3D.bin").read_bytes() for name in ("first", "second"))

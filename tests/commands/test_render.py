@@ -29,7 +29,7 @@ def base(tmp_path_factory):
     return tmp_path_factory.getbasetemp()
 
 
-def test_images_are_the_renderers_output(base, tmp_path, capsys):
+def test_images_are_the_output_of_the_renderer(base, tmp_path, capsys):
     run = finished_run.opened(base)
     command_line.run(main, [str(run.folder), "--output", str(tmp_path / "out")])
     folder = tmp_path / "out" / "test"
@@ -53,11 +53,11 @@ def test_images_are_the_renderers_output(base, tmp_path, capsys):
         assert depth.dtype == np.uint16
         highest = max(highest, depth.max())
         np.testing.assert_allclose(depth * unit, expected_depth(output), atol=unit)
-        assert 1.5 < np.median(depth * unit) < 6.5  # the cameras stand 4 from the middle of points within 1.8 of it
+        assert 1.5 < np.median(depth * unit) < 6.5  # cameras are 4 from the centre of points within 1.8
     assert highest == 65535
 
 
-def test_folders_of_splits_and_stages_do_not_collide(base, capsys):
+def test_splits_and_stages_have_separate_folders(base, capsys):
     run_folder = finished_run.folder(base)
     command_line.run(main, [str(run_folder), "--split", "train", "--stage", "coarse"])
     assert (run_folder / "renders_coarse" / "train" / "welllit" / "000000.png").is_file()
@@ -68,22 +68,22 @@ def files(folder):
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-def test_an_interrupted_folder_ends_up_as_an_uninterrupted_one(base, tmp_path, monkeypatch, capsys):
+def test_an_interrupted_rendering_is_completed_to_the_same_files(base, tmp_path, monkeypatch, capsys):
     arguments = [str(finished_run.folder(base)), "--split", "train", "--outputs", "welllit", "depth", "b2", "--output"]
     command_line.run(main, [*arguments, str(tmp_path / "whole")])
     written = []
 
-    def until_the_power_fails(path, image):
+    def interrupt_after_seven(path, image):
         if len(written) == 7:
             raise KeyboardInterrupt
         written.append(path)
         images.write_image(path, image)
 
     with monkeypatch.context() as patch:
-        patch.setattr(pictures, "write_image", until_the_power_fails)
+        patch.setattr(pictures, "write_image", interrupt_after_seven)
         with pytest.raises(SystemExit):
             command_line.run(main, [*arguments, str(tmp_path / "parts")])
-    kept = {path: path.stat().st_mtime_ns for path in written[:6]}  # the seventh is of a view that is not complete
+    kept = {path: path.stat().st_mtime_ns for path in written[:6]}  # the seventh belongs to an incomplete view
     capsys.readouterr()
     command_line.run(main, [*arguments, str(tmp_path / "parts")])
     assert "wrote 5 views to" in capsys.readouterr().out
@@ -96,7 +96,7 @@ def test_an_interrupted_folder_ends_up_as_an_uninterrupted_one(base, tmp_path, m
     np.testing.assert_allclose(exponents * (10 / 65535), expected, atol=1e-4)
 
 
-def test_frames_of_other_options_are_not_mixed(base, tmp_path, capsys):
+def test_frames_of_different_options_are_not_mixed(base, tmp_path, capsys):
     arguments = [str(finished_run.folder(base)), "--path", "spiral", "--output", str(tmp_path), "--outputs", "welllit"]
     command_line.run(main, [*arguments, "--frames", "2"])
     before = files(tmp_path)
@@ -130,7 +130,7 @@ def test_exr_holds_linear_light_and_plain_numbers(base, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_larger_picture_shows_the_same_and_another_shape_is_cut(base, tmp_path):
+def test_size_enlarges_the_picture_and_crops_it_to_another_shape(base, tmp_path):
     run = finished_run.opened(base)
     arguments = [str(run.folder), "--outputs", "welllit"]
     read = lambda size: cv2.imread(str(tmp_path / size / "test" / "welllit" / f"{name}.png"))[..., ::-1]
@@ -142,7 +142,7 @@ def test_a_larger_picture_shows_the_same_and_another_shape_is_cut(base, tmp_path
     np.testing.assert_allclose(read("72x18"), read("72")[18:36], atol=1)
 
 
-def test_pictures_side_by_side_and_the_same_as_a_video(base, tmp_path, capsys):
+def test_pictures_side_by_side_are_written_as_images_or_video(base, tmp_path, capsys):
     run = finished_run.opened(base)
     options = ["--path", "freeze-camera", "--frames", "3", "--outputs", "lowlight", "welllit", "depth"]
     arguments = [str(run.folder), *options, "--output", str(tmp_path), "--side-by-side"]
@@ -201,22 +201,22 @@ def camera_path(**changes):
         (["{run}", "--format", "exr", "--side-by-side"], "and --format png or video"),
     ],
 )
-def test_bad_input_is_one_sentence_and_exit_code_2(base, tmp_path, capsys, arguments, message):
-    places = {name: tmp_path / name for name in ("missing", "file", "late.json", "good.json")}
-    places["file"].write_text("")
-    places["late.json"].write_text(camera_path(time=1.5))
-    places["good.json"].write_text(camera_path())
-    places = {name.removesuffix(".json"): path for name, path in places.items()} | {"run": finished_run.folder(base)}
-    with pytest.raises(SystemExit) as leave:
-        command_line.run(main, [argument.format(**places) for argument in arguments])
-    assert leave.value.code == 2
+def test_invalid_input_gives_one_sentence_and_exit_2(base, tmp_path, capsys, arguments, message):
+    paths = {name: tmp_path / name for name in ("missing", "file", "late.json", "good.json")}
+    paths["file"].write_text("")
+    paths["late.json"].write_text(camera_path(time=1.5))
+    paths["good.json"].write_text(camera_path())
+    paths = {name.removesuffix(".json"): path for name, path in paths.items()} | {"run": finished_run.folder(base)}
+    with pytest.raises(SystemExit) as caught:
+        command_line.run(main, [argument.format(**paths) for argument in arguments])
+    assert caught.value.code == 2
     error = capsys.readouterr().err
     assert message in error
     assert len(error.strip().splitlines()) == 1
 
 
-def test_an_unknown_output_is_named_with_those_that_there_are(base, capsys):
-    with pytest.raises(SystemExit) as leave:
+def test_an_unknown_output_is_refused_with_a_list_of_outputs(base, capsys):
+    with pytest.raises(SystemExit) as caught:
         command_line.run(main, [str(finished_run.folder(base)), "--outputs", "colour"])
-    assert leave.value.code == 2
+    assert caught.value.code == 2
     assert "welllit" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""`python -m l2dgs_jax.simulate` as a user meets it: the twin that it writes, its report, and every mistake."""
+"""`python -m l2dgs_jax.simulate`: the low-light twin that it writes, its report, and every mistake."""
 
 import json
 import shutil
@@ -84,7 +84,7 @@ def test_the_twin_is_the_same_scene_in_the_dark(scene, tmp_path, capsys, method)
     assert "PSNR(low, well)" in capsys.readouterr().out
 
 
-def test_a_scene_without_truth_is_its_own_source(scene, tmp_path):
+def test_without_truth_the_frames_themselves_are_darkened(scene, tmp_path):
     shutil.copytree(scene, tmp_path / "plain", ignore=shutil.ignore_patterns("well", "mask"))
     run(tmp_path / "plain", tmp_path / "twin", "--downscale", 2, "--exposure", 0.03)
     source, twin = load_dataset(tmp_path / "plain", 2), load_dataset(tmp_path / "twin")
@@ -92,7 +92,7 @@ def test_a_scene_without_truth_is_its_own_source(scene, tmp_path):
     assert twin.train.masks is None
 
 
-def test_one_exposure_a_video_or_one_an_image_both_seeded(scene, tmp_path):
+def test_exposure_is_drawn_per_video_or_per_image_from_the_seed(scene, tmp_path):
     drawn = {}
     for name, options in {"video": [], "again": [], "other": ["--seed", 1], "image": ["--per-image"]}.items():
         run(scene, tmp_path / name, *options)
@@ -131,8 +131,8 @@ def test_noise_is_seeded_and_differs_from_frame_to_frame(scene, tmp_path):
     assert (one[0] - clean[0] != one[1] - clean[1]).any()
 
 
-def test_weights_of_the_release_and_brightening(scene, tmp_path):
-    """A network that brightens everything leaves the pictures alone unless it is allowed to."""
+def test_a_brightening_network_changes_nothing_unless_allowed(scene, tmp_path):
+    """The network, given by --weights, brightens everything."""
     zeros = jax.tree.map(
         lambda leaf: np.zeros(leaf.shape, np.float32), jax.eval_shape(lambda: curve_network.init(jax.random.key(0), 2))
     )
@@ -164,11 +164,11 @@ def test_weights_of_the_release_and_brightening(scene, tmp_path):
         (["--downscale", "0"], ["--downscale"]),
     ],
 )
-def test_mistakes_in_options(scene, tmp_path, refuses, options, naming):
+def test_invalid_options_are_refused(scene, tmp_path, refuses, options, naming):
     refuses(scene, tmp_path / "twin", *options, naming=naming)
 
 
-def test_mistakes_in_folders(scene, tmp_path, refuses):
+def test_invalid_folders_are_refused(scene, tmp_path, refuses):
     refuses(tmp_path / "nonsuch", tmp_path / "twin", naming=["nonsuch"])
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "mine.txt").write_text("mine")
@@ -177,7 +177,7 @@ def test_mistakes_in_folders(scene, tmp_path, refuses):
     refuses(scene, tmp_path / "file" / "twin", naming=["twin: cannot be written"])
 
 
-def test_truth_of_one_split_only(scene, tmp_path, refuses):
+def test_truth_of_one_split_only_is_refused(scene, tmp_path, refuses):
     shutil.copytree(scene, tmp_path / "half")
     for name in load_dataset(scene).train.names:
         (tmp_path / "half" / "well" / "1x" / f"{name}.png").unlink()
@@ -185,7 +185,7 @@ def test_truth_of_one_split_only(scene, tmp_path, refuses):
 
 
 @pytest.mark.parametrize("name", ["stereo_motorcycle", "retina"])
-def test_shipped_network_on_photographs_it_has_not_seen(name):
+def test_the_shipped_network_darkens_unseen_photographs(name):
     photograph = getattr(skimage.data, name)()
     image = area_average((photograph[0] if name == "stereo_motorcycle" else photograph).astype(np.float32) / 255, 4)
     darkener = darkening.network_darkener(weights.load())

@@ -1,4 +1,4 @@
-"""`python -m l2dgs_jax.sweep` as a user meets it: whole studies, killed ones, several devices and processes."""
+"""`python -m l2dgs_jax.sweep`: whole studies, killed ones, several devices and processes."""
 
 import json
 import os
@@ -14,7 +14,7 @@ from scenes import write_nerfies
 from l2dgs_jax import runs
 from l2dgs_jax.study import report, running
 
-# Devices sum in another order. Relative light is off, as rounding would decide which of its pixels clip.
+# The order of sums depends on devices. Relative light is off, as rounding would decide which pixels clip.
 STUDY = """
 scenes = ["a", "b"]
 preset = "default"
@@ -59,7 +59,7 @@ def study(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def start(study, tmp_path_factory):
-    """Starts a sweep; options of XLA by keyword."""
+    """A function that starts a sweep in a process of its own."""
     cache = str(tmp_path_factory.mktemp("cache"))
 
     def run(output, *arguments, devices=1, path=study):
@@ -79,7 +79,7 @@ def finish(*processes):
 
 
 @pytest.fixture(scope="module")
-def whole(start, tmp_path_factory):
+def uninterrupted(start, tmp_path_factory):
     """A study trained without interruption on one device."""
     folder = tmp_path_factory.mktemp("whole") / "out"
     ((printed, _, _),) = finish(start(folder))
@@ -95,8 +95,8 @@ def results(folder):
     return {member["name"]: member for member in json.loads((folder / report.JSON).read_text())["members"]}
 
 
-def assert_same_results(folder, whole):
-    found, expected = results(folder), results(whole)
+def assert_same_results(folder, uninterrupted):
+    found, expected = results(folder), results(uninterrupted)
     assert list(found) == list(expected) == NAMES
     for name in NAMES:
         assert found[name]["ended"] == expected[name]["ended"] == "finished"
@@ -105,18 +105,18 @@ def assert_same_results(folder, whole):
         assert steps == [10, 12]
 
 
-def test_every_member_is_a_run_like_any_other(whole):
+def test_every_member_is_a_run_like_any_other(uninterrupted):
     for name in NAMES:
-        run = runs.open_run(whole / name)
+        run = runs.open_run(uninterrupted / name)
         assert int(run.state.step) == run.config.steps == 12
         assert run.state.scene.alive.sum() > len(run.dataset.points)
-        assert (whole / name / runs.CONTACT_SHEET).stat().st_size > 1000
-    assert (whole / report.PLOTS).stat().st_size > 1000
-    assert (whole / report.MARKDOWN).read_text().count("finished") == 4
+        assert (uninterrupted / name / runs.CONTACT_SHEET).stat().st_size > 1000
+    assert (uninterrupted / report.PLOTS).stat().st_size > 1000
+    assert (uninterrupted / report.MARKDOWN).read_text().count("finished") == 4
 
 
-def killed_after_a_checkpoint(folder, *processes):
-    """Kill the last of some processes once every member has a checkpoint; the rest."""
+def kill_after_a_checkpoint(folder, *processes):
+    """Kill the last of some processes once every member has a checkpoint; returns the others."""
     deadline = time.monotonic() + 600
     while not all((folder / name / runs.CHECKPOINT).exists() for name in NAMES):
         assert all(process.poll() is None for process in processes)
@@ -127,17 +127,17 @@ def killed_after_a_checkpoint(folder, *processes):
     return processes[:-1]
 
 
-def test_a_killed_study_goes_on(start, whole, tmp_path):
-    killed_after_a_checkpoint(tmp_path / "out", start(tmp_path / "out"))
+def test_a_killed_study_resumes_to_the_same_results(start, uninterrupted, tmp_path):
+    kill_after_a_checkpoint(tmp_path / "out", start(tmp_path / "out"))
     assert not (tmp_path / "out" / report.JSON).exists()
     finish(start(tmp_path / "out", "--resume"))
-    assert_same_results(tmp_path / "out", whole)
+    assert_same_results(tmp_path / "out", uninterrupted)
 
 
-def test_four_devices(start, whole, tmp_path):
+def test_four_devices_give_the_same_results(start, uninterrupted, tmp_path):
     ((printed, _, _),) = finish(start(tmp_path / "out", devices=4))
     assert "devices: 4" in printed
-    assert_same_results(tmp_path / "out", whole)
+    assert_same_results(tmp_path / "out", uninterrupted)
 
 
 def address():
@@ -146,44 +146,44 @@ def address():
         return f"127.0.0.1:{probe.getsockname()[1]}"
 
 
-def both(start, output, *arguments):
-    where = address()
-    options = lambda process: ("--coordinator", where, "--processes", 2, "--process", process, *arguments)
+def start_two_processes(start, output, *arguments):
+    coordinator = address()
+    options = lambda process: ("--coordinator", coordinator, "--processes", 2, "--process", process, *arguments)
     return [start(output, *options(process)) for process in (0, 1)]
 
 
 @pytest.mark.parametrize("survivor", [0, 1])
-def test_two_processes_one_of_which_is_killed(start, whole, tmp_path, survivor):
+def test_two_processes_resume_after_one_is_killed(start, uninterrupted, tmp_path, survivor):
     folder = tmp_path / "out"
-    processes = both(start, folder)
-    (left,) = killed_after_a_checkpoint(folder, processes[survivor], processes[1 - survivor])
-    _, errors = left.communicate(timeout=120)
-    assert left.returncode != 0
+    processes = start_two_processes(start, folder)
+    (remaining,) = kill_after_a_checkpoint(folder, processes[survivor], processes[1 - survivor])
+    _, errors = remaining.communicate(timeout=120)
+    assert remaining.returncode != 0
     assert "error: this training has lost one of its processes" in errors
     assert "--resume" in errors
-    finish(*both(start, folder, "--resume"))
-    assert_same_results(folder, whole)
+    finish(*start_two_processes(start, folder, "--resume"))
+    assert_same_results(folder, uninterrupted)
 
 
 @pytest.mark.parametrize("process", [0, 1])
-def test_processes_that_do_not_find_each_other(start, tmp_path, process):
+def test_processes_that_do_not_find_each_other_give_up(start, tmp_path, process):
     options = ("--coordinator", address(), "--processes", 2, "--process", process, "--timeout", 4)
-    begun = time.monotonic()
+    start_time = time.monotonic()
     _, errors = (alone := start(tmp_path / "out", *options)).communicate(timeout=120)
     assert alone.returncode == 2
     assert "did not find each other within 4 s" in errors
     assert errors.strip().splitlines()[-1].startswith("error: ")
-    assert time.monotonic() - begun < 60
+    assert time.monotonic() - start_time < 60
     assert not (tmp_path / "out").exists()
 
 
-def test_a_member_that_diverges_is_frozen_and_reported(start, whole, study, tmp_path):
+def test_a_member_that_diverges_is_frozen_and_reported(start, uninterrupted, study, tmp_path):
     path = study.parent / "diverging.toml"
     path.write_text(STUDY + '\n[[variants]]\nname = "wild"\noptim.means_lr = 1e30\noptim.scales_lr = 1e30\n')
     finish(start(tmp_path / "out", path=path))
     found = results(tmp_path / "out")
     assert [member["ended"].split(" at ")[0] for member in found.values()] == ["finished", "finished", "diverged"] * 2
-    for name, expected in results(whole).items():
+    for name, expected in results(uninterrupted).items():
         same = next(member for key, member in found.items() if key[3:] == name[3:])
         assert same["scores"]["lowlight"] == same_scores(expected)
     frozen = next(folder for folder in (tmp_path / "out").glob("*wild"))

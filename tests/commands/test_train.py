@@ -1,4 +1,4 @@
-"""`python -m l2dgs_jax.train` as a user meets it: a whole run, a killed one, and every mistake."""
+"""`python -m l2dgs_jax.train`: a whole run, a killed one, and every mistake."""
 
 import dataclasses
 import json
@@ -68,7 +68,7 @@ def read_state(folder, scene):
     return checkpoints.load(folder / runs.CHECKPOINT, config, len(load_dataset(scene).train.names)).state
 
 
-def test_a_run_leaves_what_it_promises(finished):
+def test_a_run_writes_its_files_and_shows_its_progress(finished):
     folder, done = finished
     metrics = [json.loads(line) for line in (folder / runs.METRICS).read_text().splitlines()]
     assert metrics[-1]["step"] == 12
@@ -91,8 +91,8 @@ def test_a_killed_run_resumes_to_the_same_result(scene, environment, finished, t
         while process.poll() is None and not (folder / runs.CHECKPOINT).exists():
             time.sleep(0.02)
         process.send_signal(signal.SIGKILL)
-    lost = int(read_state(folder, scene).step)
-    assert 2 <= lost <= 12
+    saved_step = int(read_state(folder, scene).step)
+    assert 2 <= saved_step <= 12
     resumed = subprocess.run(
         command(scene, "--output", folder, "--resume"), env=environment, capture_output=True, text=True, check=False
     )
@@ -106,27 +106,27 @@ def test_a_killed_run_resumes_to_the_same_result(scene, environment, finished, t
 
 
 @pytest.mark.slow
-def test_stopped_and_killed_at_random_it_comes_to_the_same_result(scene, environment, finished, tmp_path):
-    folder, rng, ends = tmp_path / "run", np.random.default_rng(0), []
-    for stop in (signal.SIGTERM, signal.SIGKILL, signal.SIGINT, None):
+def test_a_run_stopped_and_killed_at_random_times_gives_the_same_result(scene, environment, finished, tmp_path):
+    folder, rng, exit_codes = tmp_path / "run", np.random.default_rng(0), []
+    for stop_signal in (signal.SIGTERM, signal.SIGKILL, signal.SIGINT, None):
         resume = ["--resume"] if folder.exists() else TINY
         arguments = command(scene, "--output", folder, "--json", *resume)
         with subprocess.Popen(
             arguments, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
         ) as process:
-            if stop:
+            if stop_signal:
                 assert any("compiling" in line for line in process.stdout)
                 time.sleep(rng.uniform(0, 2))
-                process.send_signal(stop)
+                process.send_signal(stop_signal)
             output, errors = process.communicate()
-        ends.append(process.returncode)
+        exit_codes.append(process.returncode)
         if process.returncode > 0:
-            assert process.returncode == 128 + stop, errors
+            assert process.returncode == 128 + stop_signal, errors
             assert f"--output {folder} --resume" in errors.splitlines()[-1]
             assert json.loads(output.splitlines()[-1])["code"] == process.returncode
         assert "Traceback" not in errors
-    assert ends[0] == 128 + signal.SIGTERM
-    assert ends[-1] == 0
+    assert exit_codes[0] == 128 + signal.SIGTERM
+    assert exit_codes[-1] == 0
     state, expected = read_state(folder, scene), read_state(finished[0], scene)
     assert_equal_states(state, expected)
 
@@ -151,22 +151,22 @@ def test_a_run_without_a_checkpoint_starts_from_the_beginning(scene, tmp_path, m
 
 
 @pytest.mark.parametrize("process", [0, 1])
-def test_only_the_process_that_shows_and_writes_needs_what_that_takes(scene, tmp_path, monkeypatch, process):
-    asked = []
+def test_only_process_0_checks_the_viewer_and_tensorboard(scene, tmp_path, monkeypatch, process):
+    checked = []
 
     def stop(*_):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(train, "load_dataset", stop)
-    monkeypatch.setattr(train, "tensorboardx", lambda: asked.append("tensorboard"))
-    monkeypatch.setattr(train, "check", lambda *_: asked.append("view"))
+    monkeypatch.setattr(train, "tensorboardx", lambda: checked.append("tensorboard"))
+    monkeypatch.setattr(train, "check", lambda *_: checked.append("view"))
     monkeypatch.setattr(train.jax, "process_index", lambda: process)
     with pytest.raises(KeyboardInterrupt):
         train.main([str(scene), "--output", str(tmp_path / "run"), "--view", "--tensorboard"])
-    assert asked == [["tensorboard", "view"], []][process]
+    assert checked == [["tensorboard", "view"], []][process]
 
 
-def test_an_interruption_before_the_first_step_is_one_word(scene, tmp_path, monkeypatch, capsys):
+def test_an_interruption_before_the_first_step_prints_one_word(scene, tmp_path, monkeypatch, capsys):
     def interrupt(*_):
         raise KeyboardInterrupt
 
@@ -206,59 +206,59 @@ def damaged(tmp_path):
     return write_nerfies(tmp_path / "damaged", 8, 24, 18, num_points=12)
 
 
-def test_missing_scene(refuses, tmp_path):
+def test_a_missing_scene_is_refused(refuses, tmp_path):
     refuses(tmp_path / "nonsuch", "--output", tmp_path / "run", naming=["nonsuch"])
     assert not (tmp_path / "run").exists()
 
 
-def test_empty_folder(refuses, tmp_path):
+def test_an_empty_folder_is_refused(refuses, tmp_path):
     (tmp_path / "empty").mkdir()
     refuses(tmp_path / "empty", "--output", tmp_path / "run", naming=["empty"])
 
 
-def test_damaged_image_leaves_no_run(refuses, damaged, tmp_path):
+def test_a_damaged_image_is_refused_and_leaves_no_run(refuses, damaged, tmp_path):
     image = next((damaged / "rgb" / "1x").iterdir())
     image.write_bytes(b"not a picture")
     refuses(damaged, "--output", tmp_path / "run", naming=[image.name])
     assert not (tmp_path / "run").exists()
 
 
-def test_nan_in_a_pose(refuses, damaged, tmp_path):
+def test_nan_in_a_pose_is_refused(refuses, damaged, tmp_path):
     camera = sorted((damaged / "camera").iterdir())[2]
     edit_json(camera, position=[0.0, float("nan"), 0.0])
     refuses(damaged, "--output", tmp_path / "run", naming=[camera.name])
 
 
-def test_unknown_preset(refuses, scene, tmp_path):
+def test_an_unknown_preset_is_refused(refuses, scene, tmp_path):
     refuses(scene, "--preset", "nonsuch", "--output", tmp_path / "run", naming=["nonsuch", "default", "paper"])
 
 
-def test_no_steps(refuses, scene, tmp_path):
+def test_counts_of_zero_are_refused(refuses, scene, tmp_path):
     for option in ("--batch-size=0", "--batch-size=-1", "--checkpoint-every=0", "--keep-checkpoints=0"):
         refuses(scene, option, "--output", tmp_path / "run", naming=[option.split("=")[0], "at least 1"])
         assert not (tmp_path / "run").exists()
     refuses(scene, "--coarse-steps=0", "--fine-steps=0", "--output", tmp_path / "run", naming=["--coarse-steps"])
 
 
-def test_output_that_holds_another_run(refuses, scene, finished):
+def test_an_output_that_holds_another_run_is_refused(refuses, scene, finished):
     refuses(scene, "--output", finished[0], naming=[str(finished[0]), "--resume"])
 
 
-def test_output_that_is_a_file(refuses, scene, tmp_path):
+def test_an_output_that_is_a_file_is_refused(refuses, scene, tmp_path):
     (tmp_path / "file").write_text("")
     refuses(scene, "--output", tmp_path / "file", naming=["file"])
 
 
-def test_output_that_cannot_be_made(refuses, scene, tmp_path):
+def test_an_output_that_cannot_be_made_is_refused(refuses, scene, tmp_path):
     (tmp_path / "file").write_text("")
     refuses(scene, "--output", tmp_path / "file" / "run", naming=["file/run"])
 
 
-def test_resume_without_a_run(refuses, scene, tmp_path):
+def test_resuming_without_a_run_is_refused(refuses, scene, tmp_path):
     refuses(scene, "--output", tmp_path / "nonsuch", "--resume", naming=["nonsuch"])
 
 
-def test_resume_with_other_settings(refuses, scene, finished):
+def test_resuming_with_other_settings_is_refused(refuses, scene, finished):
     refuses(
         scene,
         "--output",
@@ -269,21 +269,21 @@ def test_resume_with_other_settings(refuses, scene, finished):
     )
 
 
-def test_resume_from_a_truncated_checkpoint(refuses, scene, finished, tmp_path):
+def test_resuming_from_a_truncated_checkpoint_is_refused(refuses, scene, finished, tmp_path):
     (tmp_path / runs.SETTINGS).write_bytes((finished[0] / runs.SETTINGS).read_bytes())
     (tmp_path / runs.CHECKPOINT).write_bytes((finished[0] / runs.CHECKPOINT).read_bytes()[:1000])
     refuses(scene, "--output", tmp_path, "--resume", naming=["checkpoint.npz", "truncated"])
 
 
 def test_what_cannot_start_leaves_no_folder(refuses, scene, tmp_path, monkeypatch):
-    def nowhere(views):
+    def refuse_mesh(views):
         raise ValueError("2 devices leave some of the 3 processes without any")
 
-    monkeypatch.setattr(devices, "mesh", nowhere)
+    monkeypatch.setattr(devices, "mesh", refuse_mesh)
     refuses(scene, "--output", tmp_path / "run", naming=["--devices", "without any"])
     monkeypatch.undo()
-    unknown = "--optim.extent-scales"
-    refuses(scene, unknown, "means", "plane", "--output", tmp_path / "run", naming=[unknown, "planes"])
+    option = "--optim.extent-scales"
+    refuses(scene, option, "means", "plane", "--output", tmp_path / "run", naming=[option, "planes"])
     refuses(scene, "--density.spread=1", "--output", tmp_path / "run", naming=["--density.spread 1"])
     refuses(scene, "--model.moving-share=0", "--output", tmp_path / "run", naming=["--model.moving-share 0"])
     tone = ("--model.domain", "light", "--model.tone", "1.2")
@@ -293,7 +293,7 @@ def test_what_cannot_start_leaves_no_folder(refuses, scene, tmp_path, monkeypatc
     assert not (tmp_path / "run").exists()
 
 
-def test_options_of_the_run_are_read_with_every_preset(scene, tmp_path):
+def test_options_of_the_run_are_read_together_with_a_preset(scene, tmp_path):
     flags = ["--quiet", "--json", "--no-report", "--tensorboard", "--devices=1"]
     options = train._parse([str(scene), *flags, "--preset=fast", "--output", str(tmp_path / "run"), "--fine-steps=7"])
     assert (options.quiet, options.json, options.report, options.tensorboard) == (True, True, False, True)
@@ -305,8 +305,8 @@ def shown_default(capsys, arguments, option):
     with pytest.raises(SystemExit) as caught:
         train.main(arguments)
     assert caught.value.code == 0
-    boxes = capsys.readouterr().out.split(f" {option} ")[1]
-    return re.search(r"\(default: (\S+)\)", boxes)[1]
+    help_text = capsys.readouterr().out.split(f" {option} ")[1]
+    return re.search(r"\(default: (\S+)\)", help_text)[1]
 
 
 @pytest.mark.parametrize(
@@ -327,7 +327,7 @@ def test_help_shows_the_settings_of_the_preset(capsys, arguments, preset):
     assert shown_default(capsys, arguments, "--optim.heads-lr") == str(config.optim.heads_lr)
 
 
-def test_help_on_an_unknown_preset(refuses):
+def test_help_on_an_unknown_preset_is_refused(refuses):
     refuses("--preset", "nonsuch", "--help", naming=["nonsuch", "default", "paper"])
 
 
@@ -338,12 +338,12 @@ def test_an_unknown_option_is_refused(capsys, scene):
     assert "nonsuch" in capsys.readouterr().err
 
 
-def test_a_layout_that_the_scene_does_not_have(refuses, scene, tmp_path):
+def test_a_wrong_layout_or_held_out_rule_is_refused(refuses, scene, tmp_path):
     refuses(scene, "--format=llff", "--output", tmp_path / "run", naming=["poses_bounds.npy"])
     refuses(scene, "--held-out=every", "--output", tmp_path / "run", naming=["--held-out every", "4dgs"])
 
 
-def test_layout_and_held_out_views_stay_those_of_the_run(scene, tmp_path, monkeypatch):
+def test_resuming_and_opening_use_the_data_settings_of_the_run(scene, tmp_path, monkeypatch):
     config = dataclasses.replace(PRESETS["demo"], format="nerfies", held_out="5", downscale=2, frame_memory=0.5)
     runs.write_settings(tmp_path, str(scene), config)
     assert train._parse([str(scene), "--output", str(tmp_path), "--resume"]).config == config

@@ -20,28 +20,28 @@ from l2dgs_jax.runtime import command_line
 from l2dgs_jax.view import main
 from l2dgs_jax.viewer.panel import OUTPUT_NAMES
 
-PICTURE = np.s_[160:, :-340]  # above it viser may have something to say, beside it are the controls
+PICTURE = np.s_[160:, :-340]  # without viser's messages at the top and the controls at the right
 
 
-def complaint(capsys, *arguments):
+def error_message(capsys, *arguments):
     with pytest.raises(SystemExit) as end:
         command_line.run(main, [*map(str, arguments)])
     assert end.value.code == 2
     return capsys.readouterr().err
 
 
-def test_mistakes_are_one_sentence(tmp_path, capsys, monkeypatch):
+def test_mistakes_are_reported_in_one_sentence(tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("L2DGS_JAX_CACHE", "off")
     folder = finished_run.folder(tmp_path)
-    assert "--port 0: expected a number" in complaint(capsys, folder, "--port", 0)
-    assert "--host 192.0.2.1: " in complaint(capsys, folder, "--host", "192.0.2.1")
-    assert "not a training run" in complaint(capsys, tmp_path)
+    assert "--port 0: expected a number" in error_message(capsys, folder, "--port", 0)
+    assert "--host 192.0.2.1: " in error_message(capsys, folder, "--host", "192.0.2.1")
+    assert "not a training run" in error_message(capsys, tmp_path)
     monkeypatch.setitem(sys.modules, "viser", None)
-    error = complaint(capsys, folder)
+    error = error_message(capsys, folder)
     assert error == 'error: viser is not installed; expected the extra for viewing: pip install "l2dgs-jax[view]"\n'
 
 
-def test_mistakes_of_a_training_that_is_to_be_watched_leave_no_folder(tmp_path, capsys, monkeypatch):
+def test_invalid_view_options_of_a_training_leave_no_folder(tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("L2DGS_JAX_CACHE", "off")
     for option, value in (("--view-port", "0"), ("--view-host", "192.0.2.1")):
         with pytest.raises(SystemExit):
@@ -50,8 +50,8 @@ def test_mistakes_of_a_training_that_is_to_be_watched_leave_no_folder(tmp_path, 
     assert not (tmp_path / "run").exists()
 
 
-def lively_run(folder):
-    """A run in which time can be seen to pass, and exponents to differ from place to place."""
+def varied_run(folder):
+    """A run whose images change over time, and whose exponents vary over the image."""
     run = finished_run.opened(folder)
     scene = run.state.scene
     planes = scene.params.hexplane.time
@@ -63,7 +63,7 @@ def lively_run(folder):
 
 
 def changed(page, before):
-    """The picture once it is another and stands still."""
+    """The picture, once it differs from `before` and no longer changes."""
     last = before
 
     def settled():
@@ -77,8 +77,8 @@ def changed(page, before):
 
 @pytest.mark.slow
 @pytest.mark.skipif(shutil.which("chromium") is None, reason="needs Chromium")
-def test_a_browser_shows_what_its_controls_say(tmp_path):
-    command = [sys.executable, "-m", "l2dgs_jax.view", str(lively_run(tmp_path)), "--port", "8917"]
+def test_a_browser_shows_what_its_controls_select(tmp_path):
+    command = [sys.executable, "-m", "l2dgs_jax.view", str(varied_run(tmp_path)), "--port", "8917"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
         try:
             address = next(word for line in server.stdout for word in line.split() if word.startswith("http://127"))
@@ -108,9 +108,9 @@ def test_a_browser_shows_what_its_controls_say(tmp_path):
                 awaited(lambda: " ms" in other.text())
                 assert [other.value(name) for name in ("Instant", "Brightness", "Show")] == ["0", "1", "well-lit"]
                 assert not page.complaints() + other.complaints()
-                place = address.removeprefix("http://").rstrip(";")
-                here = tuple(f"{scheme}{place}" for scheme in ("http://", "ws://", "blob:http://"))
-                assert all(url.startswith((*here, "data:")) for url in page.addresses() + other.addresses())
+                host = address.removeprefix("http://").rstrip(";")
+                own_addresses = tuple(f"{scheme}{host}" for scheme in ("http://", "ws://", "blob:http://"))
+                assert all(url.startswith((*own_addresses, "data:")) for url in page.addresses() + other.addresses())
         finally:
             server.send_signal(signal.SIGTERM)
         assert server.wait(timeout=20) == 0
@@ -118,14 +118,14 @@ def test_a_browser_shows_what_its_controls_say(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.skipif(shutil.which("chromium") is None, reason="needs Chromium")
-def test_a_browser_sees_a_training_go_on(tmp_path):
+def test_a_browser_shows_the_progress_of_a_training(tmp_path):
     finished_run.folder(tmp_path)
     command = [sys.executable, "-m", "l2dgs_jax.train", str(tmp_path / "tiny_scene"), "--output", str(tmp_path / "run")]
     small = ["--model.hidden=8", "--model.plane-size=4", "--model.plane-channels=2", "--model.no-tracks"]
     small += ["--model.no-surfaces"]
     steps = ["--coarse-steps=1", "--fine-steps=100000", "--devices=1", "--no-report", "--view", "--view-port=8927"]
-    quickly = os.environ | {"XLA_FLAGS": "--xla_backend_optimization_level=0"}
-    with subprocess.Popen([*command, *small, *steps], env=quickly, stderr=subprocess.PIPE, text=True) as training:
+    environment = os.environ | {"XLA_FLAGS": "--xla_backend_optimization_level=0"}
+    with subprocess.Popen([*command, *small, *steps], env=environment, stderr=subprocess.PIPE, text=True) as training:
         try:
             address = next(line.split()[-1] for line in training.stderr if "http://127" in line)
             with opened(address, tmp_path / "profile") as tab:

@@ -57,7 +57,7 @@ def test_values_are_converted(name, value, held):
         ("loss.nonsense", 3),
     ],
 )
-def test_other_values_and_names_are_refused(name, value):
+def test_invalid_values_and_names_are_refused(name, value):
     with pytest.raises(ValueError, match=rf"{name}.*expected") as caught:
         overrides.checked(name, value)
     assert "\n" not in str(caught.value)
@@ -74,14 +74,14 @@ def test_replaced_settings_are_the_differences(values):
     assert from_dict(to_dict(changed)) == changed
 
 
-def test_an_outline_keeps_what_is_absent_apart_from_what_is_there():
+def test_outlines_distinguish_absent_from_present_values():
     without = overrides.replace(CONFIG, {"model.initial_exponents": None})
     assert overrides.outline(without) != overrides.outline(CONFIG)
     assert hash(overrides.outline(CONFIG)) == hash(overrides.outline(overrides.replace(CONFIG, {"seed": 7})))
 
 
 @given(st.dictionaries(st.sampled_from(["loss.ssim", "loss.depth", "optim.beta1", "seed"]), st.integers(2, 900)))
-def test_configs_are_what_they_have_in_common_and_what_they_differ_in(values):
+def test_partition_and_combine_restore_every_config(values):
     values = {name: overrides.checked(name, value) for name, value in values.items()}
     configs = [CONFIG, overrides.replace(CONFIG, values)]
     static, columns = overrides.partition(configs)
@@ -93,19 +93,19 @@ def test_configs_are_what_they_have_in_common_and_what_they_differ_in(values):
     assert hash(overrides.partition([configs[1], configs[0]])[0]) == hash(static)
 
 
-def test_traced_numbers_are_told_from_plain_ones():
+def test_combine_accepts_traced_numbers():
     static, _ = overrides.partition([CONFIG, overrides.replace(CONFIG, {"loss.ssim": 2.0, "seed": 3})])
     total = jax.jit(lambda values: overrides.combine(static, values).loss.ssim + CONFIG.loss.depth)
     np.testing.assert_allclose(total({"loss.ssim": 2.0, "seed": 3}), 2.001)
 
 
 @pytest.mark.parametrize("values", [{}, {"loss.ssim": 1.0, "seed": 0, "loss.depth": 1.0}, {"loss.ssim": 1.0}])
-def test_holes_are_filled_exactly(values):
+def test_missing_and_superfluous_values_are_refused(values):
     static, _ = overrides.partition([CONFIG, overrides.replace(CONFIG, {"loss.ssim": 2.0, "seed": 3})])
     with pytest.raises(ValueError, match=r"expected them for \['loss.ssim', 'seed'\]"):
         overrides.combine(static, values)
 
 
-def test_other_differences_are_refused():
+def test_differences_other_than_numbers_are_refused():
     with pytest.raises(ValueError, match=r"model.hidden is \[64, 8\]; expected settings that differ in numbers only"):
         overrides.partition([CONFIG, overrides.replace(CONFIG, {"model.hidden": 8})])

@@ -23,7 +23,7 @@ def write(path, entries, **changes):
     return path
 
 
-def test_cameras_are_turned_to_our_axes(tmp_path):
+def test_cameras_are_converted_to_opencv_axes(tmp_path):
     found = read_camera_path(write(tmp_path / "a.json", [entry(), entry(fov=60)]), SIZE)
     assert found.size == SIZE
     assert found.fps is None
@@ -45,7 +45,7 @@ def test_the_field_of_view_is_vertical(tmp_path):
 
 
 @pytest.mark.parametrize("key", ["render_time", "time"])
-def test_instants_are_the_files_or_run_evenly(tmp_path, key):
+def test_instants_are_those_of_the_file_or_evenly_spaced(tmp_path, key):
     other = {"render_time": "time", "time": "render_time"}[key]
     timed = write(tmp_path / "a.json", [entry(**{other: None, key: t}) for t in (0.5, 0, 1)])
     np.testing.assert_allclose(read_camera_path(timed, SIZE).cameras.time, [0.5, 0, 1])
@@ -73,7 +73,7 @@ def test_instants_are_the_files_or_run_evenly(tmp_path, key):
         ([entry()], {"fps": "fast"}, "'fps' is 'fast'; expected a number"),
     ],
 )
-def test_mistakes_are_one_sentence(tmp_path, entries, changes, message):
+def test_mistakes_are_reported_in_one_sentence(tmp_path, entries, changes, message):
     path = write(tmp_path / "path.json", entries, **changes)
     with pytest.raises(UserError) as error:
         read_camera_path(path, SIZE)
@@ -83,7 +83,7 @@ def test_mistakes_are_one_sentence(tmp_path, entries, changes, message):
 
 
 @pytest.mark.parametrize("content", [b"", b"{", b"[]", b"\xff\xfe", json.dumps("path").encode()])
-def test_what_is_no_such_file_is_one_sentence(tmp_path, content):
+def test_a_file_of_another_kind_is_reported_in_one_sentence(tmp_path, content):
     path = tmp_path / "path.json"
     path.write_bytes(content)
     with pytest.raises(UserError, match="nerfstudio's camera path"):

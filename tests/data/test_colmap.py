@@ -1,4 +1,4 @@
-"""COLMAP's models and the scenes around them."""
+"""Scenes with a COLMAP model."""
 
 import shutil
 import struct
@@ -32,25 +32,25 @@ POINTS = np.array([[x, y, 1.0] for x in (-0.25, 0.0, 0.3) for y in (-0.17, 0.0, 
 def reconstruction(model):
     """A pycolmap model of one camera and a frame for each of POINTS, all at the same place."""
     pycolmap = pytest.importorskip("pycolmap")
-    made = pycolmap.Reconstruction()
+    sfm_model = pycolmap.Reconstruction()
     camera = pycolmap.Camera(camera_id=3, model=model, width=WIDTH, height=HEIGHT, params=PARAMS[model])
-    made.add_camera_with_trivial_rig(camera)
+    sfm_model.add_camera_with_trivial_rig(camera)
     pose = pycolmap.Rigid3d(pycolmap.Rotation3d(Rotation.from_rotvec([0.01, -0.02, 0.1]).as_quat()), [0.02, -0.03, 0.3])
     for i, point in enumerate(POINTS):
         image = pycolmap.Image(name=f"frame {i}.png", camera_id=3, image_id=i + 1)
-        made.add_image_with_trivial_frame(image, pose)
-        made.add_point3D(point, pycolmap.Track(), np.full(3, 10 * i + 1, np.uint8))
-    return made
+        sfm_model.add_image_with_trivial_frame(image, pose)
+        sfm_model.add_point3D(point, pycolmap.Track(), np.full(3, 10 * i + 1, np.uint8))
+    return sfm_model
 
 
-def write_scene(folder, made, form):
+def write_scene(folder, sfm_model, form):
     """A scene whose frame i shows point i through the lens, as a blurred dot."""
-    place = folder / "sparse" / "0"
-    place.mkdir(parents=True)
-    {"binary": made.write_binary, "text": made.write_text}[form](str(place))
+    model_folder = folder / "sparse" / "0"
+    model_folder.mkdir(parents=True)
+    {"binary": sfm_model.write_binary, "text": sfm_model.write_text}[form](str(model_folder))
     columns, rows = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
     for i, point in enumerate(POINTS):
-        x, y = made.images[i + 1].project_point(point)
+        x, y = sfm_model.images[i + 1].project_point(point)
         blob = np.exp(-((columns - x) ** 2 + (rows - y) ** 2) / (2 * 1.3**2))
         write_image(folder / "images" / f"frame {i}.png", np.repeat((60000 * blob).astype(np.uint16)[..., None], 3, -1))
     return folder
@@ -59,15 +59,15 @@ def write_scene(folder, made, form):
 @pytest.mark.parametrize("form", ["binary", "text"])
 @pytest.mark.parametrize("model", PARAMS)
 def test_projections_agree_with_colmaps_own_and_with_the_undistorted_pictures(tmp_path, model, form):
-    made = reconstruction(model)
-    scene = write_scene(tmp_path / "scene", made, form)
+    sfm_model = reconstruction(model)
+    scene = write_scene(tmp_path / "scene", sfm_model, form)
     camera = colmap_model.read_cameras(scene / "sparse" / "0")[3]
     K, lens = colmap.pinhole_and_lens(camera)
     image = colmap_model.read_images(scene / "sparse" / "0")[0]
     local = POINTS @ image.viewmat[:3, :3].T + image.viewmat[:3, 3]
-    bent = np.stack(distort(lens, local[:, 0] / local[:, 2], local[:, 1] / local[:, 2]), -1)
-    expected = np.array([made.images[1].project_point(point) for point in POINTS])
-    np.testing.assert_allclose(bent @ K[:2, :2].T + K[:2, 2], expected, atol=1e-9)
+    distorted = np.stack(distort(lens, local[:, 0] / local[:, 2], local[:, 1] / local[:, 2]), -1)
+    expected = np.array([sfm_model.images[1].project_point(point) for point in POINTS])
+    np.testing.assert_allclose(distorted @ K[:2, :2].T + K[:2, 2], expected, atol=1e-9)
 
     dataset = data.load_dataset(scene)
     columns, rows = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
@@ -115,7 +115,7 @@ def test_pictures_are_found_where_users_keep_them(scene, place):
     assert data.load_dataset(scene, 2).train.images.max() < 0.5
 
 
-def test_smaller_copies_are_used(scene):
+def test_smaller_copies_of_the_pictures_are_used(scene):
     for path in (scene / "images").iterdir():
         write_image(scene / "images_2" / path.name, np.ones((12, 16, 3)))
     assert data.load_dataset(scene, 1).train.images.max() < 0.5
@@ -141,7 +141,7 @@ def test_black_points_have_no_colours(scene):
 
 
 def poke(kind, at, form, *values):
-    """Overwrites bytes of a file."""
+    """Overwrite bytes of a file of the model."""
 
     def change(scene):
         path = scene / "sparse" / "0" / f"{kind}.bin"
@@ -213,16 +213,16 @@ def test_a_fault_is_named_in_one_sentence(scene, fault):
 
 def test_text_with_comments_spaces_and_images_without_observations(scene):
     expected = data.load_dataset(scene)
-    place = scene / "sparse" / "0"
-    images = colmap_model.read_images(place)
+    model_folder = scene / "sparse" / "0"
+    images = colmap_model.read_images(model_folder)
     lines = ["# Image list with two lines of data per image:"]
     for i, (name, viewmat, camera) in enumerate(images):
         quat = Rotation.from_matrix(viewmat[:3, :3]).as_quat()[[3, 0, 1, 2]]
         values = " ".join(repr(float(x)) for x in (*quat, *viewmat[:3, 3]))
         lines += [f"{i + 1} {values} {camera} a  name {name}", "1.5 2.5 -1 3 4 7" if i % 2 else ""]
         (scene / "images" / name).rename(scene / "images" / f"a  name {name}")
-    (place / "images.bin").unlink()
-    (place / "images.txt").write_text("\n".join(lines) + "\n")
+    (model_folder / "images.bin").unlink()
+    (model_folder / "images.txt").write_text("\n".join(lines) + "\n")
     dataset = data.load_dataset(scene)
     assert dataset.test.names == ("a  name 000000", "a  name 000008")
     np.testing.assert_allclose(dataset.train.cameras.viewmat, expected.train.cameras.viewmat, atol=1e-6)

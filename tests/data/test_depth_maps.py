@@ -45,7 +45,7 @@ def test_a_scene_without_depth_has_none(scene):
 
 
 @pytest.mark.parametrize("change", [lambda d: d, lambda d: d[..., None], lambda d: d.astype(np.float64)])
-def test_depth_of_the_training_frames_as_dycheck_has_it(scene, change):
+def test_depth_of_training_frames_is_read_in_the_layout_of_dycheck(scene, change):
     names = train_names(scene)
     dataset = data.load_dataset(write_depth(scene, names, change=change))
     assert dataset.notes == ()
@@ -54,7 +54,7 @@ def test_depth_of_the_training_frames_as_dycheck_has_it(scene, change):
     np.testing.assert_allclose(dataset.train.depths, np.stack([depth_of(name) for name in names]), rtol=1e-6)
 
 
-def test_disparity_is_inverse_depth_and_depth_counts_where_there_are_both(scene):
+def test_disparity_is_read_as_inverse_depth_and_depth_is_preferred(scene):
     names = train_names(scene)
     write_depth(scene, names, "disparity/1x", lambda depth: 1 / depth)
     expected = np.stack([depth_of(name) for name in names])
@@ -63,7 +63,7 @@ def test_disparity_is_inverse_depth_and_depth_counts_where_there_are_both(scene)
     np.testing.assert_allclose(data.load_dataset(scene).train.depths, 2 * expected, rtol=1e-6)
 
 
-def test_pictures_of_16_bits_serve_as_well(scene):
+def test_16_bit_pictures_of_depth_are_read_up_to_scale(scene):
     names = train_names(scene)
     (scene / "depth" / "1x").mkdir(parents=True)
     for name in names:
@@ -76,7 +76,7 @@ def test_pictures_of_16_bits_serve_as_well(scene):
     np.testing.assert_allclose(ratio, ratio[0, 0, 0], rtol=1e-3)
 
 
-def test_a_smaller_pixel_has_the_mean_inverse_depth_of_its_known_samples(scene):
+def test_a_downscaled_pixel_has_the_mean_inverse_depth_of_its_known_samples(scene):
     names = train_names(scene)
 
     def with_gaps(depth):
@@ -92,7 +92,7 @@ def test_a_smaller_pixel_has_the_mean_inverse_depth_of_its_known_samples(scene):
     assert (depths > 0).sum() == depths.size - len(names)
 
 
-def test_a_lens_bends_depth_as_it_bends_pictures_but_mixes_none(tmp_path):
+def test_depth_is_undistorted_like_pictures_but_not_interpolated(tmp_path):
     scene = write_nerfies(tmp_path, radial_distortion=[0.3, 0.0, 0.0])
     names = train_names(scene)
     steps = np.where(np.arange(WIDTH) < WIDTH // 2, 1, 4) * np.ones((HEIGHT, 1))
@@ -132,14 +132,14 @@ def test_depth_that_cannot_be_used_is_mentioned(scene, kind, names, note):
         (np.array(["far"]), r"000000.npy: not a NumPy array of numbers; expected depth"),
     ],
 )
-def test_a_malformed_file_is_one_sentence(scene, content, complaint):
+def test_a_malformed_file_is_reported_in_one_sentence(scene, content, complaint):
     write_depth(scene, train_names(scene), change=lambda _: content)
     with pytest.raises(UserError, match=complaint):
         data.load_dataset(scene)
 
 
-def test_depth_in_place_of_disparity_is_refused(tmp_path):
-    """Points in view at distances that the maps know."""
+def test_depth_in_place_of_disparity_is_refused_and_vice_versa(tmp_path):
+    """The maps show the distances of the points in view, or their inverse."""
     scene = write_nerfies(tmp_path, num_points=400)
     dataset = data.load_dataset(scene)
     for kind, power in (("depth", 1), ("disparity", -1)):
@@ -157,7 +157,7 @@ def test_depth_in_place_of_disparity_is_refused(tmp_path):
             shutil.rmtree(scene / kind)
 
 
-def test_depth_lies_in_files_where_frames_do_and_counts_in_the_budget(scene):
+def test_depth_is_stored_like_frames_and_counts_towards_frame_memory(scene):
     write_depth(scene, train_names(scene))
     gib = 8 * HEIGHT * WIDTH * (6 + 4) / 2**30
     memory, file = (data.load_dataset(scene, frame_memory=factor * gib).train for factor in (1.01, 0.99))

@@ -1,4 +1,4 @@
-"""What is wrong with a scene is said in one sentence, whatever it is."""
+"""Whatever is wrong with a scene, the error message is one sentence."""
 
 import shutil
 from pathlib import Path
@@ -108,19 +108,19 @@ def test_a_fault_is_named_in_one_sentence(tmp_path, fault):
 
 
 @pytest.mark.parametrize("downscale", [-1, 0, 25, 1000])
-def test_downscale_out_of_range(scene, downscale):
+def test_a_downscale_out_of_range_is_refused(scene, downscale):
     with pytest.raises(UserError, match=f"--downscale {downscale}: expected"):
         data.load_dataset(scene, downscale)
 
 
-def test_scene_that_is_a_file(tmp_path):
+def test_a_scene_that_is_a_file_is_refused(tmp_path):
     (tmp_path / "clip.mp4").write_bytes(b"")
     with pytest.raises(UserError, match=r"clip.mp4: no such folder"):
         data.load_dataset(tmp_path / "clip.mp4")
 
 
 @pytest.mark.parametrize("call", ["iterdir", "is_dir"])
-def test_a_folder_that_cannot_be_listed(scene, monkeypatch, call):
+def test_a_folder_that_cannot_be_listed_is_reported(scene, monkeypatch, call):
     def refuse(path, *_):
         raise PermissionError(13, "Permission denied", str(path))
 

@@ -1,4 +1,4 @@
-"""Damaged files: whatever happens to a scene's JSON and binary files, only the project's own error comes out."""
+"""However a scene's JSON and binary files are damaged, loading succeeds or raises the project's own error."""
 
 import functools
 import json
@@ -26,7 +26,7 @@ WORDS = [b"nan", b"inf", b"-1", b"1e999", b"9" * 30, b'"', b"{", b"[" * 3000, b"
 
 @functools.cache
 def scene(base, layout):
-    """A scene of that layout, COLMAP's with its model as text as well."""
+    """A scene in the given layout; COLMAP's has its model as text as well."""
     source = base / "source"
     if not source.exists():
         write_nerfies(source, 6, 16, 12, num_points=12)
@@ -79,7 +79,7 @@ def damaged(draw, content, is_json):
 
 
 def _replace(draw, value):
-    """One value somewhere within replaced, or removed from its object."""
+    """The JSON value with one value inside it replaced or removed."""
     if isinstance(value, (dict, list)) and value and draw(st.integers(0, 3)):
         key = draw(st.sampled_from(sorted(value) if isinstance(value, dict) else range(len(value))))
         if isinstance(value, dict) and not draw(st.integers(0, 4)):
@@ -89,8 +89,8 @@ def _replace(draw, value):
     return draw(st.sampled_from(VALUES))
 
 
-def sentence(folder):
-    """What loading complains of, if it does."""
+def error_message(folder):
+    """The error message of loading a scene, or None."""
     try:
         data.load_dataset(folder)
     except UserError as error:
@@ -111,7 +111,7 @@ def check(base, layout, file, examples):
     @given(damaged(original, path.suffix == ".json"))
     def survives(content):
         path.write_bytes(content)
-        message = sentence(folder)
+        message = error_message(folder)
         assert message is None or (message.count("\n") == 0 and "expected" in message)
 
     try:
@@ -131,11 +131,11 @@ def base(tmp_path_factory):
 
 
 @pytest.mark.parametrize(("layout", "file"), CASES)
-def test_a_damaged_file_gives_a_sentence_or_a_scene(base, layout, file):
+def test_a_damaged_file_gives_one_sentence_or_a_scene(base, layout, file):
     check(base, layout, file, 8)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("layout", "file"), CASES)
-def test_thousands_of_damaged_files_give_a_sentence_or_a_scene(base, layout, file):
+def test_thousands_of_damaged_files_give_one_sentence_or_a_scene(base, layout, file):
     check(base, layout, file, 150)

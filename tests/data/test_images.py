@@ -1,4 +1,4 @@
-"""Picture files of every kind, as sRGB values in [0, 1]."""
+"""Picture files of every kind are read as sRGB values in [0, 1]."""
 
 import cv2
 import numpy as np
@@ -25,7 +25,7 @@ def write(path, pixels, orientation=1, **attributes):
 
 
 @pytest.mark.parametrize("suffix", [".png", ".tif", ".bmp", ".webp", ".jpg", ".jpeg", ".JPG"])
-def test_integer_formats(tmp_path, suffix):
+def test_integer_formats_are_read(tmp_path, suffix):
     smooth = np.linspace(20, 235, 24).astype(np.uint8)
     pixels = np.stack(np.broadcast_arrays(smooth[:, None], smooth[None], smooth[::-1, None]), -1)
     write(tmp_path / f"a{suffix}", np.ascontiguousarray(pixels))
@@ -44,7 +44,7 @@ def test_linear_light_becomes_srgb(tmp_path, suffix, kind):
     assert images.read_header(tmp_path / f"a{suffix}").linear
 
 
-def test_floats_that_say_they_are_srgb_stay(tmp_path):
+def test_floats_marked_as_srgb_are_not_converted(tmp_path):
     write(tmp_path / "a.tif", np.full((4, 5, 3), 0.25, np.float32), **{"oiio:ColorSpace": "sRGB"})
     assert not images.read_header(tmp_path / "a.tif").linear
     np.testing.assert_allclose(images.read_image(tmp_path / "a.tif"), 0.25)
@@ -87,7 +87,7 @@ def test_a_turned_photo_of_the_wrong_size_is_named_as_such(tmp_path):
         data.load_dataset(scene)
 
 
-def test_grey_and_alpha(tmp_path):
+def test_grey_pictures_and_alpha_are_read(tmp_path):
     pixels = np.random.default_rng(0).integers(0, 256, (5, 6, 4), np.uint8)
     for name, channels in (("grey", [0]), ("grey-alpha", [0, 3]), ("rgb", [0, 1, 2]), ("rgba", [0, 1, 2, 3])):
         write(tmp_path / f"{name}.tif", np.ascontiguousarray(pixels[..., channels]), **{"oiio:UnassociatedAlpha": 1})
@@ -99,7 +99,7 @@ def test_grey_and_alpha(tmp_path):
             np.testing.assert_allclose(alpha, pixels[..., 3:] / 255, atol=1e-6)
 
 
-def test_alpha_is_taken_out_of_colours_that_hold_it(tmp_path):
+def test_premultiplied_alpha_is_divided_out(tmp_path):
     pixels = np.zeros((1, 3, 4), np.float32)
     pixels[0] = [[0.25, 0.25, 0.25, 0.5], [0.25, 0.25, 0.25, 0], [0.25, 0.25, 0.25, 1]]
     write(tmp_path / "held.exr", pixels)
@@ -114,25 +114,25 @@ def test_alpha_is_taken_out_of_colours_that_hold_it(tmp_path):
         np.testing.assert_allclose(images.read_over_black(tmp_path / name)[0, :, 0], over_black, atol=1e-4)
 
 
-def test_alpha_is_written_beside_the_colour(tmp_path):
+def test_alpha_is_written_unassociated(tmp_path):
     pixels = np.random.default_rng(0).integers(0, 256, (5, 6, 4), np.uint8)
     pixels[0, :, 3] = 0
     images.write_image(tmp_path / "a.png", pixels)
     np.testing.assert_array_equal(cv2.imread(str(tmp_path / "a.png"), cv2.IMREAD_UNCHANGED)[..., [2, 1, 0, 3]], pixels)
 
 
-def test_undistortion_shows_a_ramp_where_it_lies():
+def test_undistortion_moves_a_ramp_to_where_the_lens_says():
     ramp = np.repeat(np.tile(np.linspace(0.1, 0.9, 60, dtype=np.float32), (40, 1))[..., None], 3, -1)
     K = np.array([[50, 0, 30], [0, 50, 20], [0, 0, 1.0]])
-    bend = lens.Lens((0.05,))
+    radial = lens.Lens((0.05,))
     x, y = np.meshgrid((np.arange(60) + 0.5 - 30) / 50, (np.arange(40) + 0.5 - 20) / 50)
-    columns = 50 * lens.distort(bend, x, y)[0] + 30
-    shown = lens.undistort(ramp, K, bend)[..., 0]
+    columns = 50 * lens.distort(radial, x, y)[0] + 30
+    shown = lens.undistort(ramp, K, radial)[..., 0]
     inside = (columns > 3) & (columns < 57)
     np.testing.assert_allclose(shown[inside], (0.1 + 0.8 * (columns - 0.5) / 59)[inside], atol=1e-5)
 
 
-def test_a_nonsensical_lens_does_no_harm():
+def test_an_absurd_lens_gives_finite_values():
     image = np.random.default_rng(0).random((8, 9, 3), np.float32)
     for terms in ((1e300, -1e300), (np.inf,), (-1e9, 1e30)):
         for fisheye in (False, True):
@@ -142,7 +142,7 @@ def test_a_nonsensical_lens_does_no_harm():
             assert np.isfinite(shown).all()
 
 
-def test_names_with_spaces_and_unicode(tmp_path):
+def test_names_with_spaces_and_unicode_are_read(tmp_path):
     write_image(tmp_path / "a b.png", np.zeros((3, 4, 3)))
     (tmp_path / "a b.png").rename(tmp_path / "ein Bild é 日.png")
     assert images.read_image(tmp_path / "ein Bild é 日.png").shape == (3, 4, 3)
@@ -157,7 +157,7 @@ def test_area_average_crops_and_averages():
 
 @pytest.mark.parametrize("channels", [None, 3, 4])
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
-def test_images_of_any_depth_and_channels(tmp_path, dtype, channels):
+def test_images_of_any_bit_depth_and_channels_are_written_and_read(tmp_path, dtype, channels):
     shape = (5, 6) if channels is None else (5, 6, channels)
     pixels = np.random.default_rng(0).integers(0, np.iinfo(dtype).max, shape, dtype, endpoint=True)
     if channels == 4:

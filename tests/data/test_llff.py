@@ -1,4 +1,4 @@
-"""Scenes of LLFF."""
+"""Scenes in the layout of LLFF."""
 
 import shutil
 
@@ -37,7 +37,7 @@ def test_axes_are_down_right_back(scene):
     np.testing.assert_allclose(K, [[focal, 0, 16], [0, focal, 12], [0, 0, 1]], rtol=1e-6)
 
 
-def test_every_eighth_is_held_out(scene):
+def test_every_eighth_frame_is_held_out(scene):
     assert data.load_dataset(scene).test.names == ("000000", "000008")
 
 
@@ -57,7 +57,7 @@ def test_random_points_lie_between_the_bounds_of_some_view(scene):
     assert seen.all()
 
 
-def test_a_colmap_model_beside_it_knows_more(scene, tmp_path):
+def test_points_of_a_colmap_model_in_the_scene_are_used(scene, tmp_path):
     colmap.write(data.load_dataset(tmp_path / "nerfies"), tmp_path / "colmap")
     shutil.copytree(tmp_path / "colmap" / "sparse", scene / "sparse")
     (scene / "points3D.ply").unlink()

@@ -77,7 +77,7 @@ def test_undistorted_dots_lie_where_the_pinhole_projects(tmp_path):
         assert dataset.train.cameras.K[0, 0, 1] == 0
 
 
-def test_lens_of_a_smaller_stored_size_is_the_same_lens(tmp_path):
+def test_stored_smaller_pictures_are_undistorted_like_averaged_ones(tmp_path):
     scene = write_nerfies(tmp_path, width=96, height=72, **LENS)
     averaged = data.load_dataset(scene, 2)
     for path in (scene / "rgb" / "1x").iterdir():
@@ -99,7 +99,7 @@ def test_coarsest_fitting_size_is_read_and_the_rest_averaged(scene):
     assert data.load_dataset(scene, 3).train.images.max() < 0.5
 
 
-def test_scene_files_split_and_time(scene):
+def test_points_splits_and_times_are_read(scene):
     dataset = data.load_dataset(scene)
     assert dataset.test.names == ("000002", "000006")
     assert dataset.train.names == ("000000", "000001", "000003", "000004", "000005", "000007")
@@ -110,7 +110,7 @@ def test_scene_files_split_and_time(scene):
         assert split.images.dtype == np.float16
 
 
-def test_time_id_and_order_stand_in_for_warp_id(scene):
+def test_time_id_or_order_replaces_a_missing_warp_id(scene):
     expected = np.array([0, 1, 3, 4, 5, 7]) / 7
     write_json(scene / "metadata.json", {f"{i:06d}": {"time_id": 3 + 2 * i} for i in range(8)})
     np.testing.assert_allclose(data.load_dataset(scene).train.cameras.time, expected, rtol=1e-6)
@@ -119,7 +119,7 @@ def test_time_id_and_order_stand_in_for_warp_id(scene):
 
 
 @pytest.mark.parametrize("num_frames", [5, 8, 9, 10])
-def test_rule_for_clips_without_held_out_frames(tmp_path, num_frames):
+def test_clips_without_held_out_frames_are_split_by_the_rule_of_4dgs(tmp_path, num_frames):
     dataset = data.load_dataset(write_nerfies(tmp_path, num_frames, val_every=None))
     train = [i for i in range(num_frames) if i % 4 == 0]
     assert [int(name) for name in dataset.train.names] == train
@@ -127,7 +127,7 @@ def test_rule_for_clips_without_held_out_frames(tmp_path, num_frames):
     assert dataset.notes == (f"{2 * len(train) - 1} of {num_frames} frames are used (held-out rule 4dgs)",)
 
 
-def test_split_files_stand_in_for_lists(scene):
+def test_split_files_replace_a_missing_dataset_json(scene):
     expected = data.load_dataset(scene)
     lists = json.loads((scene / "dataset.json").read_text())
     (scene / "dataset.json").unlink()

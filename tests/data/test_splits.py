@@ -10,27 +10,27 @@ from l2dgs_jax.errors import UserError
 NAMES = [f"{i:02d}" for i in range(17)]
 
 
-def test_rules():
+def test_held_out_rules():
     rule = lambda name: splits.hold_out("x", NAMES, splits.NO_LISTS, name, "8")
     assert rule("auto") == rule("8") == ([n for i, n in enumerate(NAMES) if i % 8], ["00", "08", "16"], ())
     note = "9 of 17 frames are used (held-out rule 4dgs)"
     assert rule("4dgs") == (["00", "04", "08", "12", "16"], ["02", "06", "10", "14"], (note,))
 
 
-def test_the_scenes_own_lists_come_first_unless_a_rule_is_asked_for():
+def test_the_scenes_own_lists_are_used_unless_a_rule_is_given():
     own = (["03", "01"], ["02"])
     assert splits.hold_out("x", NAMES, own, "auto", "8") == (*own, ())
     assert splits.hold_out("x", NAMES, own, "9", "8")[1] == ["00", "09"]
 
 
 @pytest.mark.parametrize("names", [[], ["a"], ["a", "b"]])
-def test_too_few_frames(names):
+def test_too_few_frames_are_refused(names):
     with pytest.raises(UserError, match=f"x: .* held out, of {len(names)} listed; expected at least"):
         splits.hold_out("x", names, splits.NO_LISTS, "auto", "8")
 
 
 @pytest.mark.parametrize("rule", ["", "1", "0", "-3", "every", "2.5", "9" * 30])
-def test_unknown_rules(rule):
+def test_unknown_rules_are_refused(rule):
     with pytest.raises(UserError, match=f"--held-out {rule}: expected auto, 4dgs"):
         splits.check_rule(rule)
 
@@ -38,11 +38,11 @@ def test_unknown_rules(rule):
 @pytest.mark.parametrize(
     ("names", "expected"),
     [
-        (["f_001", "f_002", "f_005"], [0, 0.25, 1]),  # numbers, as frames may be missing
+        (["f_001", "f_002", "f_005"], [0, 0.25, 1]),  # by number, as frames may be missing
         (["left_1", "left_3", "right_1", "right_3"], [0, 1, 0, 1]),  # two cameras at the same instants
         (["a9_10.5", "a9_10.7"], [0, 1]),
-        (["take7", "take7b", "take7c"], [0, 0.5, 1]),  # the same number everywhere: order
-        (["1", "2", "x"], [0, 0.5, 1]),  # not all have a number
+        (["take7", "take7b", "take7c"], [0, 0.5, 1]),  # all have the same number: by order
+        (["1", "2", "x"], [0, 0.5, 1]),  # not all have a number: by order
         (["only"], [0]),
     ],
 )
@@ -56,7 +56,7 @@ def test_instants_from_metadata(tmp_path):
         list(splits.instants(tmp_path, ["a", "b", "c"]).values()),
     ][1]
     assert instants(*({"time": t, "warp_id": 9} for t in (0.25, 0.5, 0.75))) == [0.25, 0.5, 0.75]
-    assert instants(*({"time": t} for t in (10, 20, 60))) == [0, 0.2, 1]  # seconds, say
+    assert instants(*({"time": t} for t in (10, 20, 60))) == [0, 0.2, 1]  # e.g. seconds
     assert instants(*({"warp_id": t} for t in (1, 2, 5))) == [0, 0.25, 1]
     assert instants(*({"time_id": t} for t in (5, 1, 2))) == [1, 0, 0.25]
     assert instants({}, {}, {}) == [0, 0.5, 1]

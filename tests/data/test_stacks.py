@@ -1,4 +1,4 @@
-"""Frames that do not fit into memory: the same numbers from a file, and no more memory than a frame."""
+"""Frames that do not fit into memory are read from a file: same values, one frame in memory at a time."""
 
 import tempfile
 from pathlib import Path
@@ -24,7 +24,7 @@ def frames(count=5, seed=0):
 
 
 @pytest.fixture
-def place(tmp_path, monkeypatch):
+def temporary_folder(tmp_path, monkeypatch):
     """The folder for temporary files."""
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     return tmp_path
@@ -46,14 +46,14 @@ def test_a_stack_holds_its_frames(in_file):
 
 @pytest.mark.parametrize("in_file", [False, True])
 @pytest.mark.parametrize("count", [4, 6])
-def test_a_stack_wants_as_many_frames_as_it_has_room_for(in_file, count):
+def test_a_stack_refuses_too_few_or_too_many_frames(in_file, count):
     with pytest.raises(ValueError, match="zip"):
         stacked(iter(frames()), (count, 4, 6, 3), np.float16, in_file)
 
 
-def test_a_file_leaves_no_trace_and_cannot_be_written(place):
+def test_a_stack_in_a_file_is_read_only_and_leaves_no_file_behind(temporary_folder):
     stack = stacked(iter(frames()), (5, 4, 6, 3), np.float16, in_file=True)
-    assert not list(place.iterdir())
+    assert not list(temporary_folder.iterdir())
     with pytest.raises(ValueError, match="read-only"):
         stack[0] = 0
     stack[0][:] = 0  # a copy
@@ -61,7 +61,7 @@ def test_a_file_leaves_no_trace_and_cannot_be_written(place):
 
 
 @pytest.mark.skipif(not STATUS.exists(), reason="tells resident pages of files on Linux only")
-def test_pages_that_were_read_leave_memory():
+def test_pages_of_frames_that_were_read_leave_memory():
     def resident():
         """MiB of files that are mapped and in memory."""
         return int(next(x for x in STATUS.read_text().splitlines() if x.startswith("RssFile")).split()[1]) / 1024
@@ -71,11 +71,11 @@ def test_pages_that_were_read_leave_memory():
     before = resident()
     assert sum(float(frame.sum()) for frame in stack) == 32 * 2**20
     assert resident() - before < 16
-    assert stack.view(np.ndarray).sum() == 32 * 2**20  # unlike what a plain view reads
+    assert stack.view(np.ndarray).sum() == 32 * 2**20  # a plain view keeps what it reads
     assert resident() - before > 100
 
 
-def test_the_mean_is_that_of_the_pixels_that_count():
+def test_pixel_mean_is_over_valid_pixels():
     images, valid = frames(), np.random.default_rng(1).random((5, 4, 6)) < 0.5
     in_file = stacked(iter(images), images.shape, images.dtype, in_file=True)
     for stack in (images, in_file):
@@ -91,9 +91,9 @@ def scene(tmp_path_factory):
     return write_nerfies(tmp_path_factory.mktemp("scene"), truth=True, **lens)
 
 
-def test_a_scene_beyond_its_budget_is_the_same_scene(scene, place):
+def test_a_scene_larger_than_frame_memory_has_the_same_values(scene, temporary_folder):
     memory, file = data.load_dataset(scene), data.load_dataset(scene, frame_memory=0.0)
-    assert not list(place.iterdir())
+    assert not list(temporary_folder.iterdir())
     for kept, streamed in ((memory.train, file.train), (memory.test, file.test)):
         for name in ("images", "welllit", "masks", "valid"):
             a, b = getattr(kept, name), getattr(streamed, name)
@@ -115,19 +115,19 @@ def test_a_scene_beyond_its_budget_is_the_same_scene(scene, place):
         np.testing.assert_array_equal(x, y)
 
 
-def test_the_budget_counts_the_frames_of_both_splits_and_the_truth(scene):
+def test_frame_memory_counts_the_frames_of_both_splits_and_the_truth(scene):
     gib = 2 * 8 * 24 * 32 * 3 * 2 / 2**30
     assert not isinstance(data.load_dataset(scene, frame_memory=1.01 * gib).train.images, MappedArray)
     assert isinstance(data.load_dataset(scene, frame_memory=0.99 * gib).train.images, MappedArray)
 
 
 @pytest.mark.parametrize("memory", [-1.0, float("nan")])
-def test_no_such_budget(scene, memory):
+def test_an_invalid_frame_memory_is_refused(scene, memory):
     with pytest.raises(UserError, match=rf"--frame-memory {memory}: expected GiB, from 0"):
         data.load_dataset(scene, frame_memory=memory)
 
 
-def test_no_room_is_one_clear_sentence(scene, place, monkeypatch):
+def test_a_full_disk_is_reported_in_one_sentence(scene, temporary_folder, monkeypatch):
     sentence = "cannot hold 2.6e-05 GiB of frames (No space left on device); expected TMPDIR to name a writable folder"
 
     def full(*_, **__):
@@ -138,7 +138,7 @@ def test_no_room_is_one_clear_sentence(scene, place, monkeypatch):
             patch.setattr(fails, full, raising=False)
             with pytest.raises(UserError) as caught:
                 data.load_dataset(scene, frame_memory=0.0)
-        assert str(caught.value).startswith(f"{place}: {sentence}")
-    monkeypatch.setattr(tempfile, "tempdir", str(place / "nonsuch"))
+        assert str(caught.value).startswith(f"{temporary_folder}: {sentence}")
+    monkeypatch.setattr(tempfile, "tempdir", str(temporary_folder / "nonsuch"))
     with pytest.raises(UserError, match=r"nonsuch: cannot hold .* expected TMPDIR"):
         data.load_dataset(scene, frame_memory=0.0)

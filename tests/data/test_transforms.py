@@ -1,4 +1,4 @@
-"""Scenes of Blender, D-NeRF, instant-ngp and nerfstudio."""
+"""Scenes in the layouts of Blender, D-NeRF, instant-ngp and nerfstudio."""
 
 import json
 from dataclasses import replace
@@ -12,8 +12,8 @@ from l2dgs_jax.data import clouds, colmap, transforms
 from l2dgs_jax.errors import UserError
 
 
-def turn(angle, distance=4.0):
-    """Camera to world with OpenGL's axes, on a circle around (1, 2, 3), looking there."""
+def camera_to_world(angle, distance=4.0):
+    """A camera on a circle around (1, 2, 3), looking at its centre, with OpenGL's axes."""
     back = np.array([np.sin(angle), 0.3, np.cos(angle)]) / np.hypot(1, 0.3)
     right = np.cross([0, 1, 0], back) / np.linalg.norm(np.cross([0, 1, 0], back))
     world = np.eye(4)
@@ -35,7 +35,7 @@ def blender(tmp_path):
                     "file_path": f"./{part}/r_{i:03d}",
                     "rotation": 0.1,
                     "time": i / (count - 1),
-                    "transform_matrix": turn(0.5 * i + len(part)).tolist(),
+                    "transform_matrix": camera_to_world(0.5 * i + len(part)).tolist(),
                 }
             )
         write_json(tmp_path / f"transforms_{part}.json", {"camera_angle_x": 0.7, "frames": frames})
@@ -56,7 +56,7 @@ def edit_frames(scene, **changes):
     edit_json(scene / "transforms.json", frames=merged)
 
 
-def test_a_blender_scene(blender):
+def test_a_blender_scene_is_read(blender):
     dataset = data.load_dataset(blender)
     assert dataset.train.names == tuple(f"train/r_{i:03d}" for i in range(5))
     assert dataset.test.names == tuple(f"test/r_{i:03d}" for i in range(3))
@@ -64,7 +64,7 @@ def test_a_blender_scene(blender):
     focal = 8 / np.tan(0.35)
     np.testing.assert_allclose(dataset.train.cameras.K[0], [[focal, 0, 8], [0, focal, 6], [0, 0, 1]], rtol=1e-6)
     # In OpenGL's axes a point before the camera has negative z, one above it positive y.
-    world = turn(0.5 * 2 + 5)
+    world = camera_to_world(0.5 * 2 + 5)
     seen = dataset.train.cameras.viewmat[2] @ world @ [0.3, 0.5, -2, 1]
     np.testing.assert_allclose(seen, [0.3, -0.5, 2, 1], atol=1e-5)
 
@@ -77,7 +77,7 @@ def test_alpha_is_composited_over_black(blender):
     assert data.load_dataset(blender).train.valid is None
 
 
-def test_random_points_fill_the_box_that_cameras_look_at(blender):
+def test_without_a_cloud_random_points_fill_a_box_where_the_cameras_look(blender):
     dataset = data.load_dataset(blender)
     assert "no point cloud" in dataset.notes[0]
     assert dataset.points.shape == (clouds.RANDOM_POINTS, 3)
@@ -96,7 +96,7 @@ def test_points_beside_the_scene_are_found(blender):
     assert dataset.notes == ()
 
 
-def test_a_colmap_model_beside_it_is_of_another_world(studio, tmp_path):
+def test_points_of_a_colmap_model_beside_transforms_json_are_not_used(studio, tmp_path):
     colmap.write(data.load_dataset(tmp_path / "nerfies"), tmp_path / "colmap")
     (tmp_path / "colmap" / "sparse").rename(studio / "sparse")
     (studio / "points3D.ply").unlink()
@@ -106,14 +106,14 @@ def test_a_colmap_model_beside_it_is_of_another_world(studio, tmp_path):
     assert "no point cloud" in dataset.notes[0]
 
 
-def test_val_stands_in_for_test_and_a_rule_for_both(blender):
+def test_val_replaces_a_missing_test_file_and_a_rule_replaces_both(blender):
     (blender / "transforms_test.json").unlink()
     assert data.load_dataset(blender).test.names == ("val/r_000", "val/r_001")
     (blender / "transforms_val.json").unlink()
     assert data.load_dataset(blender).test.names == ("train/r_000",)
 
 
-def test_a_nerfstudio_scene_without_lists_or_times(studio):
+def test_a_nerfstudio_scene_without_lists_or_times_is_read(studio):
     expected = data.load_dataset(studio)
     assert expected.test.names == ("000000", "000008")
     edit_frames(studio, time=None)
@@ -124,7 +124,7 @@ def test_a_nerfstudio_scene_without_lists_or_times(studio):
     np.testing.assert_allclose(loaded.train.cameras.K, expected.train.cameras.K, rtol=1e-6)
 
 
-def test_its_lists_are_its_own(studio):
+def test_the_lists_of_a_nerfstudio_scene_are_used(studio):
     edit_json(
         studio / "transforms.json",
         train_filenames=["images/000001.png", "images/000002.png"],
@@ -135,14 +135,14 @@ def test_its_lists_are_its_own(studio):
     assert data.load_dataset(studio, held_out="3").test.names == ("000000", "000003", "000006")
 
 
-def test_smaller_copies_are_used(studio):
+def test_smaller_copies_of_the_pictures_are_used(studio):
     for path in (studio / "images").iterdir():
         write_image(studio / "images_4" / path.name, np.ones((6, 8, 3)))
     assert data.load_dataset(studio, 2).train.images.max() < 0.5
     assert np.all(data.load_dataset(studio, 4).train.images == 1)
 
 
-def test_fisheye(studio):
+def test_a_fisheye_model_changes_the_undistorted_pictures(studio):
     edit_json(studio / "transforms.json", camera_model="OPENCV_FISHEYE", k1=0.1)
     fisheye = data.load_dataset(studio).train.images
     edit_json(studio / "transforms.json", camera_model="OPENCV")
@@ -169,13 +169,13 @@ def test_pictures_outside_the_scene_have_names_that_stay_inside(studio, tmp_path
     assert not (tmp_path / "escaped").exists()
 
 
-def test_frames_of_one_name_are_refused(blender):
+def test_frames_with_the_same_name_are_refused(blender):
     write_image(blender / "train" / "r_001.jpg", np.zeros((12, 16, 3)))
     for listed, message in (("train", "frames .* are both"), ("test", "frames .* are both 'train/r_001'")):
         path = blender / f"transforms_{listed}.json"
         content = json.loads(path.read_text())
-        again = {**content["frames"][0], "file_path": "train/r_001.jpg"}
-        edit_json(path, frames=[*content["frames"], again])
+        duplicate = {**content["frames"][0], "file_path": "train/r_001.jpg"}
+        edit_json(path, frames=[*content["frames"], duplicate])
         with pytest.raises(UserError, match=rf"{listed}\.json: {message}.*; expected names that differ"):
             data.load_dataset(blender)
         write_json(path, content)
@@ -246,7 +246,7 @@ def test_a_fault_is_named_in_one_sentence(studio, fault):
 
 
 @pytest.mark.parametrize("form", ["ascii", "binary_little_endian", "binary_big_endian"])
-def test_clouds_of_any_form(tmp_path, form):
+def test_ply_clouds_of_any_format_are_read(tmp_path, form):
     rng = np.random.default_rng(0)
     points, paint = rng.normal(size=(4, 3)), rng.integers(0, 256, (4, 3), np.uint8)
     head = f"ply\nformat {form} 1.0\ncomment é x\nelement vertex 4\n"

@@ -1,4 +1,4 @@
-"""Truth, masks, and which pixels count."""
+"""Ground truth, masks, and valid pixels."""
 
 import shutil
 
@@ -9,7 +9,7 @@ from scenes import GAIN, write_image, write_nerfies
 from l2dgs_jax import data
 
 
-def test_truth_and_masks(tmp_path):
+def test_truth_and_masks_are_read(tmp_path):
     dataset = data.load_dataset(write_nerfies(tmp_path, truth=True), 2)
     for split in (dataset.train, dataset.test):
         assert split.masks.dtype == bool
@@ -18,7 +18,7 @@ def test_truth_and_masks(tmp_path):
         np.testing.assert_allclose(split.welllit, GAIN * split.images.astype(float), atol=GAIN / 255)
 
 
-def test_mask_is_a_majority(tmp_path):
+def test_a_downscaled_mask_is_set_where_most_of_its_pixels_are(tmp_path):
     scene = write_nerfies(tmp_path, truth=True)
     mask = np.zeros((24, 32))
     mask[:2, :2], mask[0, 2:4] = [[1, 1], [1, 0]], 1  # three of four, two of four
@@ -29,7 +29,7 @@ def test_mask_is_a_majority(tmp_path):
     assert masks.sum() == len(masks)
 
 
-def test_truth_of_one_split_only(tmp_path):
+def test_truth_of_one_split_only_is_kept(tmp_path):
     scene = write_nerfies(tmp_path, truth=True)
     for name in data.load_dataset(scene).train.names:
         (scene / "well" / "1x" / f"{name}.png").unlink()
@@ -40,7 +40,7 @@ def test_truth_of_one_split_only(tmp_path):
     assert dataset.test.masks is None
 
 
-def test_pixels_of_alpha_0_do_not_count(tmp_path):
+def test_pixels_with_alpha_0_are_invalid(tmp_path):
     scene = write_nerfies(tmp_path)
     pixels = np.full((24, 32, 4), 0.5)
     pixels[:, 0, 3] = 0
@@ -54,7 +54,7 @@ def test_pixels_of_alpha_0_do_not_count(tmp_path):
 
 
 @pytest.mark.parametrize("downscale", [1, 2])
-def test_pixels_that_the_lens_never_saw_do_not_count(tmp_path, downscale):
+def test_pixels_that_undistortion_cannot_fill_are_invalid(tmp_path, downscale):
     assert (
         data.load_dataset(write_nerfies(tmp_path / "barrel", radial_distortion=[-0.2, 0, 0]), downscale).train.valid
         is None
@@ -69,7 +69,7 @@ def test_pixels_that_the_lens_never_saw_do_not_count(tmp_path, downscale):
         np.testing.assert_array_equal(split.valid, np.broadcast_to(expected, split.valid.shape))
 
 
-def test_covisible_masks(tmp_path):
+def test_covisible_masks_are_read(tmp_path):
     scene = write_nerfies(tmp_path)
     mask = np.zeros((12, 16))
     mask[:, :6] = 1

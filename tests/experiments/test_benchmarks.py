@@ -1,4 +1,4 @@
-"""Figures of speed and memory as the documentation shows them."""
+"""Figures of speed and memory in the documentation."""
 
 import json
 from pathlib import Path
@@ -33,6 +33,6 @@ def test_the_documentation_shows_what_was_measured(title):
     assert table.markdown(title, figures) in (ROOT / "docs" / "speed.md").read_text()
 
 
-def test_so_it_does_of_larger_scenes():
+def test_the_documentation_shows_what_was_measured_of_larger_scenes():
     figures = json.loads(BASELINE.read_text())["figures"]
     assert table.larger_scenes(figures) in (ROOT / "docs" / "speed.md").read_text()

@@ -1,4 +1,4 @@
-"""The page of methods side by side, in a browser."""
+"""The page that shows methods side by side in a browser."""
 
 import json
 import re
@@ -34,7 +34,7 @@ def study(tmp_path):
     return write
 
 
-def test_every_member_of_the_first_seed_has_pictures_of_its_own(study, monkeypatch):
+def test_every_member_of_the_first_seed_has_its_own_pictures(study, monkeypatch):
     flat = lambda grey: np.full((3, 6, 8, 3), grey, np.float32)
     cameras = Camera(np.zeros((3, 4, 4)), np.zeros((3, 3, 3)), np.array([0.5, 0.0, 1.0]))
     split = SimpleNamespace(cameras=cameras, images=flat(0.1), welllit=flat(0.9))
@@ -64,7 +64,7 @@ def test_every_member_of_the_first_seed_has_pictures_of_its_own(study, monkeypat
 
 
 @pytest.mark.parametrize("name", ["input", "truth"])
-def test_names_of_other_pictures_are_refused(study, name):
+def test_variants_named_like_other_pictures_are_refused(study, name):
     folder = study(member("00", variant=name))
     with pytest.raises(UserError, match=rf"results\.json: a variant is called '{name}'"):
         comparison.main([str(folder), str(folder / "page.html")])
@@ -82,7 +82,7 @@ def test_names_of_other_pictures_are_refused(study, name):
         (None, ["--views", "-1"], "--views -1"),
     ],
 )
-def test_mistakes_are_one_sentence(tmp_path, results, arguments, naming):
+def test_mistakes_are_refused(tmp_path, results, arguments, naming):
     if results is not None:
         (tmp_path / report.JSON).write_text(results)
     with pytest.raises(UserError, match=naming):
@@ -90,7 +90,7 @@ def test_mistakes_are_one_sentence(tmp_path, results, arguments, naming):
 
 
 @pytest.mark.parametrize("output", ["no/page.html", ""])
-def test_a_place_that_cannot_be_written_is_found_before_anything_is_rendered(study, output):
+def test_an_output_that_cannot_be_written_is_refused_before_rendering(study, output):
     folder = study(member("missing"))
     with pytest.raises(UserError, match="expected a file in an existing folder"):
         comparison.main([str(folder), str(folder / output)])
@@ -147,4 +147,4 @@ def test_time_curtain_and_enlargement_follow_the_controls(tmp_path):
     crop = [float(part.strip("%")) for part in after["crop"].split()]
     assert crop == pytest.approx(
         [100 * (found["part"] - 0.1) / 0.8, 100], abs=0.01
-    )  # a fifth is shown, and a tenth left
+    )  # a fifth is shown, a tenth to the left

@@ -26,7 +26,7 @@ BASE = PRESETS["paper"]
 
 
 @pytest.mark.parametrize("path", sorted(tables.STUDIES.glob("*.toml")), ids=lambda path: path.stem)
-def test_their_studies_can_be_read(path):
+def test_studies_of_the_tables_can_be_read(path):
     variants = {plan.variant for plan in spec.read(path).plans}
     plans = spec.read(path, ["/elsewhere"]).plans
     assert {plan.scene for plan in plans} == {"/elsewhere"}
@@ -46,7 +46,7 @@ def test_methods_of_table_1_take_equally_many_steps():
     assert configs["curve_4DGS"].model.decomposition == "curve"
 
 
-def test_every_row_of_table_3_differs_from_the_whole_by_what_it_says():
+def test_every_row_of_table_3_differs_from_the_whole_in_one_respect():
     plans = {plan.variant: plan.config for plan in spec.read(tables.STUDIES / "table3.toml", ["/a"]).plans}
     assert list(plans) == list(published.TABLE3)
     changed = {name: set(overrides.differences([plans["whole"], config])) for name, config in plans.items()}
@@ -57,8 +57,8 @@ def test_every_row_of_table_3_differs_from_the_whole_by_what_it_says():
 
 
 @pytest.mark.parametrize("rows", [*published.TABLE1.values(), published.TABLE3])
-def test_regions_of_the_papers_figures_lie_on_both_sides_of_the_whole(rows):
-    """By SSIM: of rows with a figure in the wrong column, few would."""
+def test_overall_figures_of_the_paper_lie_between_those_of_its_regions(rows):
+    """By SSIM; rows with a figure in the wrong column would mostly fail."""
     sides = []
     for cells in rows.values():
         dynamic, static, overall = (cells[region]["ssim"] for region in published.REGIONS)
@@ -88,7 +88,7 @@ def rows_of(text):
     return {name: cells for name, *cells in lines}
 
 
-def test_table_1_has_each_scene_beside_the_papers():
+def test_table_1_has_each_scene_beside_the_figures_of_the_paper():
     mochi, mine = table1.markdown(tables.collect(MEMBERS, tables.welllit)).split("## ")[1:]
     rows = rows_of(mochi.partition("\n\n")[2])
     assert rows["L2DGS"] == ["1.0", "0.50", "–", "2.0", "0.50", "–", "3.0", "0.50", "–"]
@@ -109,13 +109,13 @@ def test_low_light_ends_in_a_mean():
     assert rows["paper: L2DGS"][-2:] == ["31.9", "0.94"]
 
 
-def test_what_learns_from_brightened_frames_has_no_low_light_scores():
+def test_methods_trained_on_brightened_frames_have_no_low_light_scores():
     brightened = member("mochi", "gamma", 0, 5.0) | {"scores": {"region_convention": "nsff"}}
     rows = rows_of(lowlight.markdown(tables.collect([*MEMBERS, brightened], lowlight.lowlight)))
     assert rows["mochi: gamma"] == rows["mean: gamma"] == ["–"] * 6
 
 
-def test_points_of_a_grid_are_rows_of_their_own():
+def test_points_of_a_grid_have_separate_rows():
     grid = [member("mochi", "a", seed, level, level=level) for seed in (0, 1) for level in (1.0, 2.0)]
     plain = member("mochi", "b", 0, 3.0, level=3.0)
     rows = tables.collect([*grid, plain], tables.welllit)["mochi"]
@@ -129,7 +129,7 @@ def test_points_of_a_grid_are_rows_of_their_own():
     assert set(labels(nameless[:1]).values()) == {"the preset"}
 
 
-def test_what_diverged_is_in_no_mean_and_is_named(tmp_path, capsys):
+def test_diverged_members_are_in_no_mean_and_are_named(tmp_path, capsys):
     diverged = [member("mochi", name, 1, 99.0, ended="diverged at step 7") for name in ("L2DGS", "without_exposure")]
     found = tables.collect([*MEMBERS, *diverged], tables.welllit)["mochi"]
     assert found["L2DGS"]["dynamic"]["psnr"] == 1.0
@@ -142,7 +142,7 @@ def test_what_diverged_is_in_no_mean_and_is_named(tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_weights_of_lpips_fill_its_columns_of_what_was_scored_without(tmp_path, tmp_path_factory, monkeypatch):
+def test_lpips_is_added_to_members_that_were_scored_without_its_weights(tmp_path, tmp_path_factory, monkeypatch):
     monkeypatch.setitem(metrics.NETWORKS, "alex", networks.TINY)
     monkeypatch.setitem(SMALLEST_SIDE, "alex", 1)
     np.savez(tmp_path / "tiny.npz", **networks.state_dict("alex"))
@@ -167,7 +167,7 @@ def test_weights_of_lpips_fill_its_columns_of_what_was_scored_without(tmp_path, 
 
 
 @pytest.mark.slow
-def test_a_quick_table_goes_on_where_it_stands(tmp_path):
+def test_a_quick_table_is_resumed_without_training_again(tmp_path):
     write_nerfies(tmp_path / "mochi", 10, 24, 18, num_points=40, truth=True)
     study = tmp_path / "study.toml"
     study.write_text('scenes = ["mochi", "no"]\n[[variants]]\nname = "a"\npreset = "enhance-4dgs"\nenhance = "gamma"\n')

@@ -1,4 +1,4 @@
-"""The user study: what its page asks, what answers to it add up to, and what is refused."""
+"""The user study: its page, the table of its answers, and what is refused."""
 
 import json
 import re
@@ -28,7 +28,7 @@ def person(tmp_path, name, *answers, study="night-0"):
     return tmp_path / f"{name}.json", {"study": study, "participant": name, "answers": list(answers)}
 
 
-def test_letters_are_dealt_anew_for_every_scene(tmp_path):
+def test_letters_are_assigned_to_methods_anew_for_every_scene(tmp_path):
     """Choosing A everywhere is no preference: the letter stands for another method in each scene."""
     people = dict([person(tmp_path, "one", answer("Scene 1", 0, "A", A=5, B=2), answer("Scene 2", 0, "A", A=4, B=1))])
     found = aggregate(KEY, people)
@@ -82,7 +82,7 @@ def test_answers_to_something_else_are_refused(tmp_path, given, naming):
     assert naming in str(caught.value)
 
 
-def test_nobody_answers_twice(tmp_path):
+def test_answers_of_one_participant_in_two_files_are_refused(tmp_path):
     path, content = person(tmp_path, "one", answer("Scene 1", 0, "A"))
     with pytest.raises(UserError, match="one"):
         aggregate(KEY, {path: content, tmp_path / "again.json": content})
@@ -105,12 +105,12 @@ def test_a_page_is_blind_and_its_order_comes_from_the_seed(tmp_path):
     assert pages["a"] == pages["b"] != pages["c"]
     assert all(set(dealt.values()) == {"ours", "theirs"} for dealt in pages["a"].values())
     page = (tmp_path / "a.html").read_text()
-    shown = re.sub(r'data:[^"]*', "", page)  # letters of a picture may spell anything
+    shown = re.sub(r'data:[^"]*', "", page)  # encoded pictures may spell anything
     assert not [word for word in ("ours", "theirs", "moose", "otter", "zebra") if word in shown]
     assert "http" not in page
 
 
-def test_a_page_that_may_have_been_answered_is_not_written_over(tmp_path):
+def test_a_page_that_may_have_been_answered_is_not_overwritten(tmp_path):
     folder = media(tmp_path / "media")
     user_study.main(["page", str(folder), str(tmp_path / "a.html")])
     (tmp_path / "a.html").unlink()
@@ -119,7 +119,7 @@ def test_a_page_that_may_have_been_answered_is_not_written_over(tmp_path):
     assert not (tmp_path / "a.html").exists()
 
 
-def test_a_page_and_its_key_are_left_together_or_not_at_all(tmp_path):
+def test_a_page_and_its_key_are_written_together_or_not_at_all(tmp_path):
     folder = media(tmp_path / "media")
     for name, blocked in (("a", "a.key.json"), ("b", "b.html")):
         (tmp_path / blocked).mkdir()
@@ -131,7 +131,7 @@ def test_a_page_and_its_key_are_left_together_or_not_at_all(tmp_path):
 
 
 @pytest.mark.parametrize("change", [{"study": 0}, {"methods": None}, {"key": []}])
-def test_something_else_in_place_of_the_key_is_one_sentence(tmp_path, change):
+def test_malformed_keys_and_answers_are_refused(tmp_path, change):
     path, answers = person(tmp_path, "one", answer("Scene 1", 0, "A"))
     for file, content in ((path, answers), (tmp_path / "key.json", KEY | change)):
         file.write_text(json.dumps(content))
@@ -147,7 +147,7 @@ def test_something_else_in_place_of_the_key_is_one_sentence(tmp_path, change):
         (lambda folder: [path.rename(path.with_suffix(".txt")) for path in folder.glob("*/*.png")], "no pictures"),
     ],
 )
-def test_a_folder_that_makes_no_study_is_one_sentence(tmp_path, change, naming):
+def test_a_folder_unsuitable_for_a_study_is_refused(tmp_path, change, naming):
     change(folder := media(tmp_path / "media"))
     with pytest.raises(UserError, match=naming):
         user_study.main(["page", str(folder), str(tmp_path / "out.html")])
@@ -156,8 +156,8 @@ def test_a_folder_that_makes_no_study_is_one_sentence(tmp_path, change, naming):
 
 @pytest.mark.slow
 @pytest.mark.skipif(not shutil.which("chromium"), reason="no browser")
-def test_what_is_clicked_is_what_is_counted(tmp_path):
-    """A judge who can see through the letters: black pictures, those of ours, are always best, and rated 4."""
+def test_clicks_are_counted_as_answers(tmp_path):
+    """The judge always prefers black pictures, those of the method `ours`, and rates them 4."""
     user_study.main(["page", str(media(tmp_path / "media")), str(tmp_path / "night.html"), "--seed", "3"])
     script = """
     const black = image => {

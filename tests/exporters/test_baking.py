@@ -1,4 +1,4 @@
-"""Baked colours: what a file shows, drawn from that file alone, is the well-lit scene."""
+"""Baked colours: a file, drawn without anything else, shows the well-lit scene."""
 
 import dataclasses
 
@@ -52,7 +52,7 @@ def read(data):
 
 
 def images(gaussians, run):
-    """What every other training camera sees of Gaussians with colours."""
+    """Gaussians with colours, rendered from every other training camera."""
     viewmat, K = (jnp.asarray(x[1::2], float) for x in run.dataset.train.cameras[:2])
     size = run.dataset.width, run.dataset.height
     return np.asarray(rasterize(*(jnp.asarray(x, float) for x in gaussians), viewmat, K, *size).features)
@@ -87,13 +87,13 @@ def test_the_fit_brings_colours_closer_at_every_instant(run, baked, monkeypatch)
     assert all(baking.closeness(run, *splats, time) > unfitted + 3 for splats, time in zip(baked, TIMES, strict=True))
 
 
-def test_brighter_colours_come_closer(run, baked):
+def test_colours_beyond_one_come_closer(run, baked):
     (splats,) = next(baking.bake(run, TIMES, brightest=1.25))
     assert 1 < splats.colors.max() <= 1.25
     assert baking.closeness(run, splats, TIMES[0]) > baking.closeness(run, *baked[0], TIMES[0])
 
 
-def test_closeness_is_that_of_views_not_fitted_to(run, baked):
+def test_closeness_is_measured_in_views_not_fitted_to(run, baked):
     for time, (splats,) in zip(TIMES, baked, strict=True):
         errors = np.square(images(splats, run) - exact_images(time, run)).mean((1, 2, 3))
         closeness = baking.closeness(run, splats, time)
@@ -101,7 +101,7 @@ def test_closeness_is_that_of_views_not_fitted_to(run, baked):
 
 
 @pytest.mark.slow
-def test_colours_of_dark_images_are_fitted_beside_those_of_well_lit_ones(run, baked):
+def test_colours_of_low_light_images_are_fitted_along_with_those_of_well_lit_ones(run, baked):
     welllit, lowlight = next(baking.bake(run, TIMES, images=("welllit", "lowlight")))
     np.testing.assert_allclose(welllit.colors, baked[0][0].colors, atol=1e-6)
     np.testing.assert_array_equal(welllit.means, lowlight.means)
@@ -110,7 +110,7 @@ def test_colours_of_dark_images_are_fitted_beside_those_of_well_lit_ones(run, ba
 
 
 @pytest.mark.slow
-def test_a_background_is_left_to_the_viewer(run):
+def test_the_background_is_not_baked_into_colours(run):
     model = dataclasses.replace(run.config.model, background=0.8)
     bright = dataclasses.replace(run, config=dataclasses.replace(run.config, model=model))
     (splats,) = next(baking.bake(bright, TIMES))
@@ -135,7 +135,7 @@ VALUES = {"domain": "values", "relative_light": False}
         ({"decomposition": "curve"}, 0.8),
     ],
 )
-def test_the_background_is_the_well_lit_image_of_nothing(run, settings, expected):
+def test_the_background_is_the_well_lit_image_of_an_empty_scene(run, settings, expected):
     model = dataclasses.replace(run.config.model, background=0.8, **settings)
     bare = dataclasses.replace(run, config=dataclasses.replace(run.config, model=model))
     assert baking.background(bare) == pytest.approx(expected)

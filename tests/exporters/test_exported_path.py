@@ -1,4 +1,4 @@
-"""Camera paths for nerfstudio, against its own definitions."""
+"""Camera paths for nerfstudio, checked against its definitions."""
 
 import json
 
@@ -11,7 +11,7 @@ from l2dgs_jax.types import Camera
 WIDTH, HEIGHT = 64, 48
 
 
-def test_points_are_seen_where_the_cameras_see_them():
+def test_points_project_to_the_same_pixels_by_nerfstudios_definitions():
     rng = np.random.default_rng(0)
     viewmat = np.tile(np.eye(4), (5, 1, 1))
     viewmat[:, :3, :3] = Rotation.random(5, rng).as_matrix()

@@ -1,4 +1,4 @@
-"""Every format of splats, read back by what its specification says and nothing of ours."""
+"""Every format of splats, read back according to its specification."""
 
 import json
 import struct
@@ -16,7 +16,7 @@ SH_C0 = 0.28209479177387814
 
 @pytest.fixture
 def splats():
-    """Some of all sizes, with opacities and scales at the ends of their ranges."""
+    """Splats of all sizes, some with opacities, colours and scales at the ends of their ranges."""
     rng = np.random.default_rng(0)
     count = 50
     quats = rng.normal(size=(count, 4))
@@ -58,8 +58,8 @@ def test_a_splat_file_has_32_bytes_a_gaussian_and_the_most_prominent_first(splat
     levels = np.frombuffer(data, np.uint8).reshape(50, 32)[:, 24:]
     prominence = floats[:, 3:].astype(float).prod(-1) * levels[:, 3] / 255
     assert (np.diff(prominence) <= 0.002 * prominence[:-1] + 1e-9).all()
-    places = {tuple(mean): i for i, mean in enumerate(splats.means.tolist())}
-    order = [places[tuple(mean)] for mean in floats[:, :3].tolist()]
+    indices = {tuple(mean): i for i, mean in enumerate(splats.means.tolist())}
+    order = [indices[tuple(mean)] for mean in floats[:, :3].tolist()]
     assert sorted(order) == list(range(50))
     np.testing.assert_array_equal(floats[:, 3:], splats.scales[order])
     np.testing.assert_allclose(levels[:, :3] / 255, np.minimum(splats.colors, 1)[order], atol=0.51 / 255)
@@ -127,7 +127,7 @@ def test_a_cloud_is_a_ply_file_of_coloured_points(splats, tmp_path):
     np.testing.assert_allclose(colors, np.minimum(splats.colors, 1), atol=0.51 / 255)
 
 
-def test_what_nothing_would_show_is_left_out(splats):
+def test_splats_too_faint_to_be_seen_are_left_out(splats):
     splats.opacities[:4] = 0, 0.9 / 255, 1.1 / 255, 1
     shown = visible(splats)
     np.testing.assert_array_equal(shown.means, splats.means[2:])

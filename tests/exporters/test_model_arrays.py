@@ -1,4 +1,4 @@
-"""The whole model as arrays: every one is documented, and the documentation's program renders it."""
+"""The whole model as arrays: all are documented, and the program in the documentation renders them."""
 
 import dataclasses
 import re
@@ -39,16 +39,16 @@ def test_every_array_is_documented_and_plain(run, tmp_path):
         assert all(model[name].dtype.kind in "biU" or model[name].dtype == np.float32 for name in model)
 
 
-def test_dead_gaussians_stay_behind(run):
+def test_dead_gaussians_are_not_exported(run):
     scene = run.state.scene
     some_dead = scene._replace(alive=scene.alive.at[jnp.array([0, 5])].set(False))
     fewer = dataclasses.replace(run, state=run.state._replace(scene=some_dead))
-    before, after = (model_arrays(which)["gaussians/means"] for which in (run, fewer))
+    before, after = (model_arrays(scene_run)["gaussians/means"] for scene_run in (run, fewer))
     np.testing.assert_array_equal(np.delete(before, [0, 5], axis=0), after)
 
 
 @pytest.mark.parametrize("part", [{"decomposition": "none"}, {"ocd": False}, {"unit_exponent": "b1"}])
-def test_what_the_program_does_not_render_is_not_exported(run, part):
+def test_models_that_the_documented_program_cannot_render_are_refused(run, part):
     config = dataclasses.replace(run.config, model=dataclasses.replace(run.config.model, **part))
     with pytest.raises(UserError, match=f"model.{next(iter(part))} is"):
         model_arrays(dataclasses.replace(run, config=config))

@@ -1,4 +1,4 @@
-"""Tracks: integers that stand for Gaussians which move, read back."""
+"""Tracks: moving Gaussians stored as integers, and read back."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ BRIGHTEST = 1.25
 
 @pytest.fixture
 def instants():
-    """Gaussians at key instants: still ones, ones that move, and one that never shows; colours for two images."""
+    """Gaussians at key instants: static, moving, and one always invisible; with colours for two images."""
     rng = np.random.default_rng(0)
     count = STILL + MOVING + 1
     moves = rng.permutation(count) >= STILL
@@ -21,15 +21,15 @@ def instants():
     start, velocity = rng.normal(0, 1, (count, 3)), rng.normal(0, 0.3, (count, 3)) * moves[:, None]
     axes, scales = rng.normal(0, 1, (count, 3)), np.exp(rng.normal(-3, 1, (count, 3)))
     opacities = np.where(np.arange(count) == hidden, 0.003, rng.uniform(0.1, 1, count))
-    made = []
+    gaussians = []
     for time in np.linspace(0, 1, KEYS):
         quats = Rotation.from_rotvec(axes * (1 + time * moves[:, None])).as_quat(scalar_first=True)
         quats *= rng.choice([-1, 1], (count, 1))  # the same rotations
         grown = scales * np.exp(0.5 * time * moves[:, None])
         arrays = (start + time * velocity, quats, grown, opacities, rng.uniform(0, BRIGHTEST, (count, 3)))
         welllit = Splats(*(array.astype(np.float32) for array in arrays))
-        made.append((welllit, welllit._replace(colors=welllit.colors / 2)))
-    return made
+        gaussians.append((welllit, welllit._replace(colors=welllit.colors / 2)))
+    return gaussians
 
 
 def quantised(instants):
@@ -38,14 +38,14 @@ def quantised(instants):
 
 
 def in_order(splats, like):
-    """Gaussians in the order of those whose centres are nearest."""
-    apart = np.linalg.norm(splats.means[:, None] - like.means[None], axis=-1)
-    nearest = apart.argmin(0)
+    """Gaussians in the order of those in `like`, matched by nearest centres."""
+    distances = np.linalg.norm(splats.means[:, None] - like.means[None], axis=-1)
+    nearest = distances.argmin(0)
     assert len(set(nearest)) == len(like.means) == len(splats.means)
     return Splats(*(rows[nearest] for rows in splats))
 
 
-def test_key_instants_come_back_as_exact_as_the_integers_are(instants):
+def test_key_instants_are_restored_to_the_precision_of_the_integers(instants):
     packed = quantised(instants)
     assert packed.still.positions.shape == (1, STILL, 3)
     assert packed.moving.positions.shape == (KEYS, MOVING, 3)
@@ -62,7 +62,7 @@ def test_key_instants_come_back_as_exact_as_the_integers_are(instants):
             assert (one.inv() * other).magnitude().max() < 0.02
 
 
-def test_between_key_instants_all_is_interpolated(instants):
+def test_values_between_key_instants_are_interpolated(instants):
     packed = quantised(instants)
     before, middle, after = (tracks.at(packed, time / (KEYS - 1))[0] for time in (1, 1.5, 2))
     for name in ("means", "opacities", "colors"):
@@ -73,7 +73,7 @@ def test_between_key_instants_all_is_interpolated(instants):
     assert ((one.inv() * half).magnitude() < 0.6 * (one.inv() * other).magnitude() + 1e-3).all()
 
 
-def test_what_nobody_sees_does_not_change(instants):
+def test_gaussians_do_not_move_while_they_are_invisible(instants):
     count = len(instants[0][0].means)
     last = [
         tuple(x._replace(opacities=x.opacities * (key == KEYS - 1)) for x in pair) for key, pair in enumerate(instants)

@@ -1,4 +1,4 @@
-"""The page for browsers: put together here, and opened in one."""
+"""The web page of a scene: its contents, and what it shows in a browser."""
 
 import base64
 import dataclasses
@@ -31,7 +31,7 @@ def run(tmp_path_factory):
 
 
 class Elements(HTMLParser):
-    """Elements and what they hold."""
+    """The elements of a page, with their attributes and text."""
 
     def __init__(self, page):
         super().__init__()
@@ -58,10 +58,10 @@ def random_tracks(run):
     return tracks.quantise(instants, rows(), OVERBRIGHT)
 
 
-def test_a_page_holds_everything_and_asks_for_nothing(run):
+def test_a_page_contains_everything_and_loads_nothing(run):
     named = dataclasses.replace(run, dataset=dataclasses.replace(run.dataset, name="</script><b>A & B"))
-    made = random_tracks(run)
-    page = web_page.page(named, made, np.array([[30.0, 40], [32, 42]]), SECONDS)
+    quantised = random_tracks(run)
+    page = web_page.page(named, quantised, np.array([[30.0, 40], [32, 42]]), SECONDS)
     elements = Elements(page)
     assert elements.text("title") == elements.text("h1") == "</script><b>A & B"
     assert "b" not in {tag for tag, _, _ in elements.found}
@@ -71,13 +71,13 @@ def test_a_page_holds_everything_and_asks_for_nothing(run):
     assert [camera["time"] for camera in description["cameras"]] == sorted(
         camera["time"] for camera in description["cameras"]
     )
-    assert zlib.decompress(base64.b64decode(elements.text("script", id="data"))) == tracks.pack(made)
+    assert zlib.decompress(base64.b64decode(elements.text("script", id="data"))) == tracks.pack(quantised)
     assert not {"src", "srcset", "action"} & {name for _, attributes, _ in elements.found for name in attributes}
     assert {a["href"] for _, a, _ in elements.found if "href" in a} == {"data:,"}
     assert not re.search(r"https?:|//cdn|@import|url\(", page)
 
 
-def test_controls_have_names(run):
+def test_controls_have_accessible_names(run):
     elements = Elements(web_page.page(run, random_tracks(run), np.full((2, 2), 30.0), SECONDS))
     for tag, attributes, text in elements.found:
         if tag in ("button", "input", "canvas"):
@@ -85,14 +85,14 @@ def test_controls_have_names(run):
 
 
 @pytest.fixture(scope="module")
-def shown(run, tmp_path_factory):
+def baked_page(run, tmp_path_factory):
     """Tracks of a baked scene that moves, and the page that plays them."""
     instants = list(bake(run, np.linspace(0, 1, 5).tolist(), OVERBRIGHT, web_page.IMAGES))
     sizes = web_page.pixel_sizes(run.dataset.train.cameras, instants, near_plane(run))
-    made = tracks.quantise(instants, sizes, OVERBRIGHT)
+    quantised = tracks.quantise(instants, sizes, OVERBRIGHT)
     path = tmp_path_factory.mktemp("page") / "scene.html"
-    path.write_text(web_page.page(run, made, np.full((1, 2), 30.0), SECONDS), "utf-8")
-    return made, path
+    path.write_text(web_page.page(run, quantised, np.full((1, 2), 30.0), SECONDS), "utf-8")
+    return quantised, path
 
 
 WIDTH, HEIGHT = 240, 180  # ten times what the scene was trained at
@@ -101,13 +101,13 @@ needs_chromium = pytest.mark.skipif(not shutil.which("chromium"), reason="needs 
 
 
 @pytest.fixture(scope="module")
-def visit(shown, tmp_path_factory):
-    """A function that opens the page, with nothing over the picture and time standing still."""
-    with browser.opened(shown[1].as_uri(), tmp_path_factory.mktemp("browser"), (WIDTH, HEIGHT)) as tab:
-        yield lambda: at_rest(tab())
+def visit(baked_page, tmp_path_factory):
+    """A function that opens the page, paused and with nothing over the picture."""
+    with browser.opened(baked_page[1].as_uri(), tmp_path_factory.mktemp("browser"), (WIDTH, HEIGHT)) as tab:
+        yield lambda: paused(tab())
 
 
-def at_rest(page):
+def paused(page):
     browser.awaited(lambda: page.says("document.getElementById('controls')?.hidden === false"))
     if page.says("document.getElementById('play').textContent") == "Pause":
         page.says("document.getElementById('play').click()")
@@ -116,7 +116,7 @@ def at_rest(page):
 
 
 def picture(page):
-    """What the page shows when nothing changes any more."""
+    """What the page shows once it no longer changes."""
     browser.awaited(lambda: page.says("document.getElementById('view').ariaBusy") == "false")
     return page.picture() / 255
 
@@ -135,12 +135,12 @@ def stand_at(page, run, index):
 
 @pytest.mark.slow
 @needs_chromium
-def test_the_player_draws_as_the_rasterizer_does(run, shown, visit):
+def test_the_player_draws_as_the_rasterizer_does(run, baked_page, visit):
     page = visit()
     for index in (0, 3, 6):
         camera = stand_at(page, run, index)
         for image in range(2):
-            splats = tracks.at(shown[0], float(camera.time))[image]
+            splats = tracks.at(baked_page[0], float(camera.time))[image]
             arrays = [
                 jnp.asarray(x, float) for x in (*splats, camera.viewmat, resize(camera, WIDTH // run.dataset.width).K)
             ]
@@ -172,7 +172,7 @@ def test_the_page_shows_what_the_model_renders(run, visit):
 def test_controls_change_the_picture_and_reset_brings_it_back(visit):
     page = visit()
     page.says("document.getElementById('reset').click()")
-    inside = np.s_[5:-5, 5:-5]  # of the ring that shows the focus
+    inside = np.s_[5:-5, 5:-5]  # within the ring that shows the focus
     first = picture(page)[inside]
     differs = lambda: np.abs(picture(page)[inside] - first).mean() > 0.003
 

@@ -1,4 +1,4 @@
-"""The forms that an operation can take, as contexts to run a test in."""
+"""The forms of an operation, as contexts in which a test runs."""
 
 import contextlib
 import warnings
@@ -10,8 +10,8 @@ from l2dgs_jax.kernels import selection, use_kernels
 
 # None: what the platform decides, which is the form for CPUs here.
 FORMS = ("reference", "accelerator", None)
-# The form for CPUs asked for by name, and what a compiler gets that it was not tried with.
-ROUNDABOUT = ("cpu", pytest.param("untried", marks=pytest.mark.slow))
+# The form for CPUs chosen by name, and the form for a compiler that the kernels were not tested with.
+OTHER_WAYS = ("cpu", pytest.param("untried", marks=pytest.mark.slow))
 
 
 @contextlib.contextmanager
@@ -21,7 +21,7 @@ def form(name, monkeypatch):
         with use_kernels(name):
             yield
         return
-    jax.clear_caches()  # what was compiled with the forms for CPUs must not be found again
+    jax.clear_caches()  # programs compiled with the forms for CPUs must not be used again
     monkeypatch.setattr(selection, "TESTED", False)
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "jaxlib .* was not tried", RuntimeWarning)
@@ -36,8 +36,8 @@ def any_form(request, monkeypatch):
         yield request.param
 
 
-@pytest.fixture(params=(*FORMS, *ROUNDABOUT), ids=str)
+@pytest.fixture(params=(*FORMS, *OTHER_WAYS), ids=str)
 def any_way(request, monkeypatch):
-    """The test runs in every form, whichever way one comes to it."""
+    """The test runs in every form, chosen in every way."""
     with form(request.param, monkeypatch):
         yield request.param

@@ -1,4 +1,4 @@
-"""Blending of lists of any lengths: every form, in blocks that are full and that are not, and its gradient."""
+"""Blending of lists of any length: every form, in full and partial blocks, and the gradient."""
 
 import jax
 import jax.numpy as jnp
@@ -37,36 +37,36 @@ def with_gradient(packed, lists, cotangent):
 compiled = jax.jit(with_gradient)
 
 
-def one_by_one(packed, lists):
-    """Every pixel on its own."""
+def blend_pixel_by_pixel(packed, lists):
+    """The definition, for one pixel after the other."""
     packed, columns = np.asarray(packed), -(-WIDTH // TILE_SIZE)
     image = np.zeros((TILES, CHANNELS, TILE_SIZE * TILE_SIZE))
     for tile, (start, stop) in enumerate(zip(lists.starts, lists.stops, strict=True)):
         for pixel in range(TILE_SIZE * TILE_SIZE):
             x = TILE_SIZE * (tile % columns) + pixel % TILE_SIZE + 0.5
             y = TILE_SIZE * (tile // columns) + pixel // TILE_SIZE + 0.5
-            light = 1.0
+            transmittance = 1.0
             for mx, my, a, b, c, opacity, *features in packed[np.asarray(lists.gaussians[start:stop])]:
                 dx, dy = x - mx, y - my
                 alpha = min(0.999, opacity * np.exp(-0.5 * (a * dx * dx + 2 * b * dx * dy + c * dy * dy)))
                 if alpha < 1 / 255:
                     continue
-                if light * (1 - alpha) <= 1e-4:
+                if transmittance * (1 - alpha) <= 1e-4:
                     break
-                image[tile, :, pixel] += light * alpha * np.array(features)
-                light *= 1 - alpha
+                image[tile, :, pixel] += transmittance * alpha * np.array(features)
+                transmittance *= 1 - alpha
     return image
 
 
-def test_the_reference_is_the_definition():
+def test_the_reference_matches_the_definition():
     packed, lists = case()
     with use_kernels("reference"):
-        np.testing.assert_allclose(blend(packed, lists, WIDTH, HEIGHT), one_by_one(packed, lists), atol=1e-12)
+        np.testing.assert_allclose(blend(packed, lists, WIDTH, HEIGHT), blend_pixel_by_pixel(packed, lists), atol=1e-12)
         few = lists._replace(stops=jnp.minimum(lists.stops, lists.starts + 2))
         check_grads(jax.jit(lambda p: blend(p, few, WIDTH, HEIGHT)), (0.4 * packed,), 1, ["rev"], eps=1e-6)
 
 
-def assert_the_reference():
+def assert_matches_the_reference():
     packed, lists = case()
     cotangent = jnp.asarray(np.random.default_rng(1).normal(size=(TILES, CHANNELS, TILE_SIZE * TILE_SIZE)))
     actual = compiled(packed, lists, cotangent)
@@ -76,32 +76,32 @@ def assert_the_reference():
         np.testing.assert_allclose(a, e, rtol=1e-10, atol=1e-12)
 
 
-def test_every_form_is_the_reference(any_way):
-    assert_the_reference()
+def test_every_form_matches_the_reference(any_way):
+    assert_matches_the_reference()
 
 
 @pytest.mark.parametrize("block", [3, 5])
-def test_blocks_that_are_full_and_that_are_not(monkeypatch, block):
+def test_full_and_partial_blocks_match_the_reference(monkeypatch, block):
     monkeypatch.setattr(accelerator, "BLOCK_SIZE", block)
     packed, lists = case(seed=block)
     cotangent = jnp.ones((TILES, CHANNELS, TILE_SIZE * TILE_SIZE))
     with use_kernels("accelerator"):
-        actual = jax.jit(lambda *arrays: with_gradient(*arrays))(packed, lists, cotangent)  # with these blocks
+        actual = jax.jit(lambda *arrays: with_gradient(*arrays))(packed, lists, cotangent)  # recompiled
     with use_kernels("reference"):
         expected = compiled(packed, lists, cotangent)
     for a, e in zip(actual, expected, strict=True):
         np.testing.assert_allclose(a, e, rtol=1e-10, atol=1e-12)
 
 
-def test_a_single_gaussian(any_form):
+def test_a_single_gaussian_is_blended(any_form):
     packed, lists = case()
     alone = lists._replace(gaussians=0 * lists.gaussians, stops=jnp.minimum(lists.stops, lists.starts + 1))
     value, gradient = compiled(packed[:1], alone, jnp.ones((TILES, CHANNELS, TILE_SIZE * TILE_SIZE)))
-    np.testing.assert_allclose(value, one_by_one(packed[:1], alone), atol=1e-12)
+    np.testing.assert_allclose(value, blend_pixel_by_pixel(packed[:1], alone), atol=1e-12)
     assert np.isfinite(gradient).all()
 
 
-def test_batches_are_one_larger_image(any_form):
+def test_vmap_equals_a_loop(any_form):
     cases = [case(seed) for seed in range(2)]
     packed, lists = (jax.tree.map(lambda *x: jnp.stack(x), *x) for x in zip(*cases, strict=True))
     cotangent = jnp.ones((TILES, CHANNELS, TILE_SIZE * TILE_SIZE))
@@ -112,7 +112,7 @@ def test_batches_are_one_larger_image(any_form):
         np.testing.assert_allclose(actual, wanted, rtol=1e-10, atol=1e-12)
 
 
-def test_no_gaussian_at_all(any_form):
+def test_no_gaussians_give_zeros(any_form):
     packed, lists = case()
     nothing = TileLists(lists.gaussians[:1], 0 * lists.starts, 0 * lists.stops)
     value, gradient = with_gradient(packed[:0], nothing, jnp.ones((TILES, CHANNELS, TILE_SIZE * TILE_SIZE)))
@@ -124,7 +124,7 @@ def test_no_gaussian_at_all(any_form):
     assert not gradient.any()
 
 
-def test_a_nan_shows(any_form):
+def test_nan_is_not_hidden(any_form):
     packed, lists = case()
-    which = int(lists.gaussians[0])
-    assert np.isnan(jax.jit(lambda p: blend(p, lists, WIDTH, HEIGHT))(packed.at[which, 0].set(jnp.nan))[0]).any()
+    row = int(lists.gaussians[0])
+    assert np.isnan(jax.jit(lambda p: blend(p, lists, WIDTH, HEIGHT))(packed.at[row, 0].set(jnp.nan))[0]).any()

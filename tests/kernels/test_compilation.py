@@ -8,7 +8,7 @@ from l2dgs_jax.kernels.compilation import native_call, unfused
 from l2dgs_jax.kernels.fusion import fusion_boundary, repeat_channels
 
 
-def test_rows_added_in_turn_are_a_scatter():
+def test_adding_rows_one_by_one_equals_a_scatter():
     random = np.random.default_rng(0)
     table, rows = jnp.asarray(random.normal(size=(7, 3))), jnp.asarray(random.normal(size=(4, 5, 3)))
     ids = jnp.asarray(random.integers(0, 7, (4, 5)), jnp.int32)  # 20 rows into 7: most are hit more than once
@@ -16,7 +16,7 @@ def test_rows_added_in_turn_are_a_scatter():
     np.testing.assert_allclose(added, table.at[ids].add(rows), rtol=1e-14)
 
 
-def test_what_is_compiled_together_or_apart_computes_the_same():
+def test_native_calls_and_unfused_functions_compute_the_same():
     def function(x, y):
         return {"sum": jax.lax.fori_loop(0, 5, lambda i, total: total + jnp.sin(i * x) * y, y), "x": 2 * x}
 
@@ -27,13 +27,13 @@ def test_what_is_compiled_together_or_apart_computes_the_same():
         jax.tree.map(lambda a, e: np.testing.assert_allclose(a, e, rtol=1e-13), actual, expected)
 
 
-def test_channels_are_repeated_and_its_gradient_sums():
+def test_channels_are_repeated_and_the_gradient_sums_over_them():
     x = jnp.asarray(np.random.default_rng(1).normal(size=(2, 3)))
     np.testing.assert_array_equal(repeat_channels(x, 4), np.repeat(x[..., None], 4, axis=-1))
     check_grads(jax.jit(lambda x: repeat_channels(x, 4) ** 2), (x,), order=1)
 
 
-def test_a_fusion_boundary_and_its_gradient_are_those_of_the_function():
+def test_a_fusion_boundary_keeps_values_and_gradients():
     function = lambda x, pair: (x * pair[0], {"sum": jnp.sin(pair[1]) + x})
     arguments = jnp.linspace(0.5, 2, 5), (jnp.linspace(-1, 1, 5), jnp.linspace(2, 3, 5))
     for staged in (fusion_boundary(function), jax.vmap(fusion_boundary(function))):

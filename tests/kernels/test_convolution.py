@@ -1,4 +1,4 @@
-"""Convolution of few channels in every form against XLA's, alone and vmapped, and its gradients."""
+"""Convolution of few channels: every form compared with XLA's, alone and vmapped, with gradients."""
 
 import jax
 import jax.numpy as jnp
@@ -7,7 +7,7 @@ import pytest
 
 from l2dgs_jax.kernels.convolution import convolve
 
-# Sizes that are no multiple of the rows or the pixels that go together.
+# Not multiples of the numbers of rows or pixels that are processed together.
 SHAPES = [(5, 2, 8), (3, 8, 16), (3, 1, 16), (3, 16, 2), (7, 4, 4)]
 
 
@@ -40,12 +40,12 @@ def test_every_form_agrees_with_the_general_convolution(any_way, shape):
     assert_close(jax.jit(with_gradients(convolve))(*arrays), with_gradients(plain)(*arrays))
 
 
-def test_vmapped_kernels_and_images_are_a_loop_over_them(any_form):
+def test_vmapped_kernels_and_images_equal_a_loop(any_form):
     arrays = case(3, 4, 8, 3)
-    apart = [
+    alone = [
         jnp.stack(x) for x in zip(*(with_gradients(plain)(*(a[i] for a in arrays)) for i in range(3)), strict=True)
     ]
-    assert_close(jax.jit(jax.vmap(with_gradients(convolve)))(*arrays), apart)
+    assert_close(jax.jit(jax.vmap(with_gradients(convolve)))(*arrays), alone)
     x, kernels, _ = arrays
     shared = jax.jit(jax.vmap(convolve, (None, 0)))(x[0], kernels)
     np.testing.assert_allclose(shared, jnp.stack([plain(x[0], k) for k in kernels]), rtol=1e-11, atol=1e-11)
@@ -62,7 +62,7 @@ def test_other_sizes_take_the_general_convolution(shape):
 
 
 def test_single_precision_keeps_its_digits():
-    """One by one, the products of 32,000 pixels would leave a sum correct to four digits at most."""
+    """Summed one by one, the products of 32,000 pixels would be correct to four digits at most."""
     x, kernel, _ = case(3, 8, 8)
     x = jnp.tile(x, (1, 8, 5, 1)) + 1
     gradient = jax.grad(lambda kernel, x: convolve(x, kernel).sum())
@@ -76,7 +76,7 @@ def test_a_cotangent_known_to_be_zero_compiles():
     np.testing.assert_array_equal(gradient(kernel, x), 0)
 
 
-def test_no_image_at_all(any_form):
+def test_no_images_give_an_empty_result_and_a_zero_gradient(any_form):
     x, kernel = jnp.ones((0, 18, 21, 4)), jnp.ones((3, 3, 4, 4))
     assert jax.jit(convolve)(x, kernel).shape == (0, 18, 21, 4)
     np.testing.assert_array_equal(jax.grad(lambda kernel: convolve(x, kernel).sum())(kernel), 0)

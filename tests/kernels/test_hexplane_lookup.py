@@ -1,4 +1,4 @@
-"""Lookups in planes and lines: every form, its gradients and batches against the reference."""
+"""Lookups in planes and lines: every form, its gradients and batches compared with the reference."""
 
 import functools
 
@@ -42,7 +42,7 @@ def assert_close(actual, expected):
 @pytest.mark.parametrize(
     ("aggregation", "points"), [("paired_sum", POINTS), ("product", POINTS), ("product", 1), ("product", 0)]
 )
-def test_every_form_is_the_reference(any_way, aggregation, points):
+def test_every_form_matches_the_reference(any_way, aggregation, points):
     layout = Layout(SIZES, VIEWS, aggregation)
     arrays = case(points)
     cotangent = jnp.asarray(np.random.default_rng(1).normal(size=(VIEWS, 2 * points, CHANNELS)))
@@ -55,12 +55,12 @@ def test_every_form_is_the_reference(any_way, aggregation, points):
 @pytest.mark.parametrize("aggregation", ["paired_sum", "product"])
 def test_gradients_of_the_reference(aggregation):
     space, lines, cell, weight = case(2)
-    look = lambda space, lines, weight: lookup(space, lines, cell, weight, Layout(SIZES, VIEWS, aggregation))
+    function = lambda space, lines, weight: lookup(space, lines, cell, weight, Layout(SIZES, VIEWS, aggregation))
     with use_kernels("reference"):
-        check_grads(jax.jit(look), (space, lines, weight), order=1, modes=["rev"], eps=1e-5)
+        check_grads(jax.jit(function), (space, lines, weight), order=1, modes=["rev"], eps=1e-5)
 
 
-def test_batches(any_form):
+def test_vmap_equals_a_loop(any_form):
     layout = Layout(SIZES, VIEWS, "paired_sum")
     cases = [case(seed=seed) for seed in range(3)]
     stacked = jax.tree.map(lambda *x: jnp.stack(x), *cases)

@@ -1,4 +1,4 @@
-"""Programs lowered for machines that are not here hold what suits those, and nothing that is meant for this CPU."""
+"""Programs lowered for other platforms contain nothing of the forms for CPUs."""
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +13,7 @@ from l2dgs_jax.rasterizer import rasterize
 from l2dgs_jax.training import initial_state
 from l2dgs_jax.training.step import train_step
 
-MARKS = ("small_call", "inlineable")  # of what is compiled apart for a CPU
+MARKS = ("small_call", "inlineable")  # of functions compiled separately for a CPU
 CONFIG = tiny(sh_warmup=1)
 
 
@@ -59,13 +59,13 @@ def test_no_other_platform_gets_the_forms_for_cpus(programs, name, platform):
 
 
 @pytest.mark.parametrize("name", ["rasterizer", "gradient", "train step", "renderer"])
-def test_a_cpu_gets_them(programs, name):
+def test_a_cpu_gets_the_forms_for_cpus(programs, name):
     function, arguments = programs[name]
     text = jax.jit(function).trace(*arguments).lower().as_text()
     assert all(mark in text for mark in MARKS)
 
 
-def test_whoever_asks_for_the_accelerators_form_gets_it_on_a_cpu():
+def test_the_accelerator_form_can_be_chosen_on_a_cpu():
     with use_kernels("accelerator"):
         text = jax.jit(gradient).trace(*scene()).lower().as_text()
     assert not [mark for mark in MARKS if mark in text]

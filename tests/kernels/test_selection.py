@@ -14,7 +14,7 @@ from l2dgs_jax.kernels.selection import by_form
 
 
 def add(x, y):
-    """Adds another number in each form."""
+    """x + a + 1, 2 or 4, depending on the form."""
     return by_form(
         x,
         y,
@@ -29,7 +29,7 @@ X = jnp.arange(3.0)
 Y = {"a": jnp.ones(3)}
 
 
-def test_the_setting_decides_also_about_what_was_compiled_before():
+def test_the_setting_also_decides_for_functions_compiled_before():
     compiled = jax.jit(add)
     for form, constant in (("reference", 1), ("cpu", 2), ("accelerator", 4), (None, 2), ("reference", 1)):
         with use_kernels(form):
@@ -46,13 +46,13 @@ def test_without_a_setting_the_platform_lowered_for_decides(platform):
     assert constants == {"2" if platform == "cpu" else "4"}
 
 
-def test_one_program_for_two_platforms_holds_both():
+def test_one_program_for_two_platforms_contains_both_forms():
     text = jax.jit(add).trace(X, Y).lower(lowering_platforms=("cpu", "cuda")).as_text()
     assert "dense<2.000000e+00>" in text
     assert "dense<4.000000e+00>" in text
 
 
-def test_only_what_is_needed_is_traced():
+def test_only_the_form_that_runs_is_traced():
     def fail(x):
         raise AssertionError
 
@@ -60,14 +60,14 @@ def test_only_what_is_needed_is_traced():
     np.testing.assert_array_equal(jax.jit(f)(X), jnp.sin(X))
 
 
-def test_batches_in_any_axis_and_shared_arguments():
+def test_vmap_over_any_axis_and_with_shared_arguments():
     x = jnp.arange(6.0).reshape(3, 2)
     np.testing.assert_array_equal(jax.jit(jax.vmap(add, (1, None), 1))(x, Y), x + 3)
     twice = jax.vmap(jax.vmap(add, (0, None)), (None, 0))(X, {"a": x})
     np.testing.assert_array_equal(twice, np.asarray(X)[None, :, None] + np.asarray(x)[:, None] + 2)
 
 
-def test_an_untried_compiler_gets_the_general_form_and_says_so_once(monkeypatch):
+def test_an_untested_compiler_gets_the_general_form_with_one_warning(monkeypatch):
     monkeypatch.setattr(selection, "TESTED", False)
     selection._warn_of_untested_compiler.cache_clear()
     with pytest.warns(RuntimeWarning, match=r"jaxlib .* was not tried .*; expected jaxlib 0\.10"):
@@ -76,7 +76,7 @@ def test_an_untried_compiler_gets_the_general_form_and_says_so_once(monkeypatch)
     np.testing.assert_array_equal(jax.jit(lambda x: add(x + 0, Y))(X), X + 5)
 
 
-def test_another_form_is_refused():
+def test_an_unknown_form_is_refused():
     with pytest.raises(ValueError, match="expected one of reference, cpu, accelerator, or None"):
         use_kernels("gpu")
 
@@ -94,12 +94,12 @@ def test_the_environment_sets_the_form_of_a_process(value, constant):
     assert float(done.stdout) == constant, done.stderr
 
 
-def test_a_misspelt_environment_is_one_sentence(monkeypatch):
+def test_a_misspelt_environment_variable_is_refused_in_one_sentence(monkeypatch):
     monkeypatch.setenv(selection.ENV_VARIABLE, "fast")
     selection._from_environment.cache_clear()
     with pytest.raises(UserError, match="L2DGS_JAX_KERNELS is 'fast'; expected one of reference, cpu, accelerator"):
         add(X, Y)
     with use_kernels("reference"):
-        add(X, Y)  # is not asked
+        add(X, Y)  # the environment is not read
     monkeypatch.undo()
     selection._from_environment.cache_clear()

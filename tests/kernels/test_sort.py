@@ -15,15 +15,15 @@ _argsort = jax.jit(argsort)
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @settings(deadline=None, max_examples=30)
 @given(seed=st.integers(0, 2**32 - 1), ties=st.booleans())
-def test_argsort_is_numpys_stable_one(form, dtype, seed, ties):
+def test_argsort_equals_numpys_stable_argsort(form, dtype, seed, ties):
     values = np.random.default_rng(seed).normal(size=300).astype(dtype)
     values[:4] = np.inf, -np.inf, np.nan, 0
-    values = np.round(values, 1) + 0.0 if ties else values  # no -0.0, which numpy takes for a 0.0
+    values = np.round(values, 1) + 0.0 if ties else values  # no -0.0, which numpy considers equal to 0.0
     with use_kernels(form):
         np.testing.assert_array_equal(_argsort(jnp.asarray(values)), np.argsort(values, kind="stable"))
 
 
-def test_argsort_in_a_batch_and_of_hardly_anything(any_form):
+def test_argsort_of_batches_and_of_up_to_two_values(any_form):
     values = jnp.asarray(np.random.default_rng(0).normal(size=(3, 50)))
     np.testing.assert_array_equal(jax.jit(jax.vmap(argsort))(values), np.argsort(values, axis=-1))
     for size in range(3):
@@ -43,7 +43,7 @@ def test_pairs_are_sorted_by_tile_and_rank(any_way, tile_count, rank_count):
         np.testing.assert_array_equal(actual, wanted)
 
 
-def test_batches_of_pairs(any_form):
+def test_batches_of_pairs_equal_a_loop(any_form):
     tiles = jnp.asarray(np.random.default_rng(0).integers(0, 9, (3, 60)), jnp.int32)
     ranks = jnp.tile(jnp.arange(60, dtype=jnp.int32), (3, 1))
     sort = lambda t, r: sort_pairs(t, r, 8, 60)

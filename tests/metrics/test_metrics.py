@@ -35,7 +35,7 @@ def frames(seed=0, count=3, height=14, width=17):
 
 
 @pytest.mark.parametrize("shape", [(11, 11, 3), (23, 17, 3), (12, 31, 1)], ids=str)
-def test_ssim_is_scikit_images(shape):
+def test_ssim_matches_scikit_image(shape):
     a, b = pair(0, *shape)
     mean, full = structural_similarity(a, b, full=True, **REFERENCE)
     np.testing.assert_allclose(ssim(jnp.asarray(a), jnp.asarray(b)), mean, atol=1e-12)
@@ -105,7 +105,7 @@ def test_batches_are_scored_image_by_image():
         np.testing.assert_allclose(together[1, 2], one, rtol=1e-12)
 
 
-def test_psnr_is_scikit_images():
+def test_psnr_matches_scikit_image():
     a, b = pair(8, 9, 10, 3)
     expected = peak_signal_noise_ratio(a, b, data_range=1)
     np.testing.assert_allclose(psnr(jnp.asarray(a), jnp.asarray(b)), expected, rtol=1e-12)
@@ -114,7 +114,7 @@ def test_psnr_is_scikit_images():
     assert psnr(jnp.asarray(a), jnp.asarray(a)) == jnp.inf
 
 
-def test_masked_psnr_sees_the_mask_alone():
+def test_masked_psnr_depends_on_the_mask_only():
     a, b = pair(9, 12, 13, 3)
     mask = np.zeros((12, 13), bool)
     mask[3:7, 2:9] = True
@@ -161,7 +161,7 @@ def test_mixed_precision_frames_are_accepted():
 
 
 def partial_ssim_by_windows(a, b, mask):
-    """DyCheck's mSSIM (arXiv 2210.13445), spelled out window by window."""
+    """DyCheck's mSSIM (arXiv 2210.13445), computed window by window."""
     window = np.exp(-0.5 * (np.arange(-5, 6) / 1.5) ** 2)
     window /= window.sum()
 
@@ -195,7 +195,7 @@ def partial_ssim_by_windows(a, b, mask):
 
 
 @pytest.mark.parametrize("share", [1.0, 0.7, 0.03])
-def test_partial_ssim_is_dychecks(share):
+def test_partial_ssim_matches_dycheck(share):
     a, b = pair(11, 15, 17, 3)
     mask = np.random.default_rng(0).random((15, 17)) < share
     actual = metrics.partial_ssim(jnp.asarray(a), jnp.asarray(b), jnp.asarray(mask))
@@ -204,20 +204,20 @@ def test_partial_ssim_is_dychecks(share):
         np.testing.assert_allclose(actual, ssim(jnp.asarray(a), jnp.asarray(b)), atol=1e-12)
 
 
-def test_pixels_that_do_not_count_change_no_score():
+def test_invalid_pixels_change_no_score():
     prediction, truth, moving = next(frames())
     valid = np.random.default_rng(1).random(moving.shape) < 0.8
-    seen = np.random.default_rng(2).random(moving.shape) < 0.5
-    scores = metrics.compare(prediction, truth, moving, valid, seen)
+    covisible = np.random.default_rng(2).random(moving.shape) < 0.5
+    scores = metrics.compare(prediction, truth, moving, valid, covisible)
     assert scores.keys() == {"overall", "dynamic", "static", "covisible"}
     other = np.where(valid[..., None], truth, 1 - truth)
-    assert metrics.compare(prediction, other, moving, valid, seen) == scores
-    for region, mask in (("overall", valid), ("dynamic", valid & moving), ("covisible", valid & seen)):
+    assert metrics.compare(prediction, other, moving, valid, covisible) == scores
+    for region, mask in (("overall", valid), ("dynamic", valid & moving), ("covisible", valid & covisible)):
         expected = peak_signal_noise_ratio(truth[mask], prediction[mask], data_range=1)
         np.testing.assert_allclose(scores[region]["psnr"], expected, rtol=1e-12)
     replaced = np.where(valid[..., None], truth, prediction)
-    for region, mask in (("overall", valid), ("covisible", valid & seen)):
+    for region, mask in (("overall", valid), ("covisible", valid & covisible)):
         np.testing.assert_allclose(
             scores[region]["ssim"], partial_ssim_by_windows(prediction, replaced, mask), atol=1e-12
         )
-    assert metrics.compare(prediction, truth, moving, np.zeros_like(valid), seen) == {}
+    assert metrics.compare(prediction, truth, moving, np.zeros_like(valid), covisible) == {}

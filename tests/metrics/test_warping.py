@@ -1,4 +1,4 @@
-"""The warping error of videos whose motion is known."""
+"""The warping error of videos with known motion."""
 
 import numpy as np
 import pytest
@@ -18,18 +18,18 @@ def video(brighter=0.0):
 
 
 @pytest.mark.parametrize("brighter", [0.0, 0.1])
-def test_what_moves_with_the_flow_differs_only_by_its_flicker(brighter):
+def test_motion_along_the_flow_has_only_the_error_of_its_flicker(brighter):
     error = warping_error_map(*video(brighter))
     np.testing.assert_array_equal(np.isfinite(error), np.isfinite(video()[2]).all(-1))
     np.testing.assert_allclose(error[np.isfinite(error)], brighter**2, atol=1e-6)
 
 
-def test_what_does_not_move_with_the_flow_differs():
+def test_motion_that_differs_from_the_flow_has_an_error():
     frame, following, flow = video()
     assert np.nanmean(warping_error_map(frame, following, 0 * flow)) > 0.01
 
 
-def test_pixels_that_are_not_seen_have_no_error():
+def test_nan_pixels_have_no_error():
     frame, following, flow = video()
     frame, following = frame.copy(), following.copy()
     frame[0, 0] = following[10, 12] = np.nan

@@ -1,4 +1,4 @@
-"""Rows of arrays apart from the rest and back again."""
+"""Selecting rows of arrays, and expanding them to the full size again."""
 
 import jax
 import jax.numpy as jnp
@@ -23,14 +23,14 @@ def test_the_highest_are_chosen_and_keep_their_order(subset):
 
 
 @pytest.mark.parametrize("axis", [0, 1])
-def test_rows_come_back_to_where_they_were(subset, axis):
+def test_expand_puts_selected_rows_back_in_place(subset, axis):
     values = np.random.default_rng(0).normal(size=(6, 6))
-    apart = select(jnp.asarray(values), subset, axis)
-    np.testing.assert_array_equal(apart, np.take(values, ROWS, axis))
+    selected = select(jnp.asarray(values), subset, axis)
+    np.testing.assert_array_equal(selected, np.take(values, ROWS, axis))
     kept = np.zeros(6)
     kept[ROWS] = 1
     expected = values * (kept[:, None] if axis == 0 else kept)
-    np.testing.assert_array_equal(expand(apart, subset, axis), expected)
+    np.testing.assert_array_equal(expand(selected, subset, axis), expected)
 
 
 @pytest.mark.parametrize("function", [select, expand])

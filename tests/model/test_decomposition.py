@@ -35,7 +35,7 @@ def make_features(*shape, low=0.1, high=0.9, dtype=jnp.float64):
 
 @jax.jit
 def gradients(features, bafe):
-    """Of the sum of all images."""
+    """Gradients of the sum of all images."""
 
     def objective(features, bafe):
         return sum(image.sum() for image in decompose(features, bafe, CFG))
@@ -67,7 +67,7 @@ def test_images_follow_eqs_5_to_9():
 LIGHT = ModelConfig(domain="light", relative_light=True, initial_illumination=0.7)
 
 
-def test_in_the_domain_of_light_eqs_7_and_9_are_of_the_light_that_values_stand_for():
+def test_in_the_light_domain_eqs_7_and_9_apply_to_linear_light():
     features = make_features(2, 4, 5, low=0.05, high=1.5)
     images = jax.tree.map(np.asarray, decompose(features, make_bafe(), LIGHT))
     light, color = images.illumination[..., None], srgb_to_linear(images.reflectance)
@@ -78,14 +78,14 @@ def test_in_the_domain_of_light_eqs_7_and_9_are_of_the_light_that_values_stand_f
     assert (bright > 1).any()
 
 
-def test_what_it_starts_from_is_full_light():
+def test_at_the_initial_illumination_the_well_lit_image_is_the_reflectance():
     features = make_features(2, 4, 5).at[..., 0].set(0.7)
     images = decompose(features, make_bafe(), LIGHT)
     np.testing.assert_allclose(images.welllit, images.reflectance, rtol=1e-9)
 
 
-def test_gradients_of_the_images_in_the_domain_of_light():
-    # Dim light: what lies beyond 1 has no gradient.
+def test_gradients_of_the_images_in_the_light_domain():
+    # Dim light, as values clipped at 1 have no gradient.
     features, bafe = make_features(2, 4, 5).at[..., 0].multiply(0.7), make_bafe()
     check_grads(jax.jit(partial(decompose, cfg=LIGHT)), (features, bafe), 1, ("rev",), 1e-5, 1e-5, eps=1e-6)
     black = jnp.zeros((1, 4, 5, 6))
@@ -129,7 +129,7 @@ def test_power_near_zero(dtype):
         assert slopes[0][0] == 0
 
 
-def test_clipping_is_live_on_its_bounds_and_dead_outside():
+def test_clipping_has_gradients_on_its_bounds_but_none_outside():
     x = jnp.asarray([-1e30, -1e-9, 0.0, 0.5, 1.0, 1 + 1e-9, 1e30])
     np.testing.assert_array_equal(clip_unit(x), [0, 0, 0, 0.5, 1, 1, 1])
     np.testing.assert_array_equal(jax.vmap(jax.grad(clip_unit))(x), [0, 0, 1, 1, 1, 0, 0])
@@ -154,7 +154,7 @@ def test_one_black_factor_blackens_both_images(channels):
     assert all_finite(gradients(features, make_bafe()))
 
 
-def test_one_pixel():
+def test_a_single_pixel_is_finite():
     features = make_features(1, 1, 1)
     assert all_finite(decompose_jit(features, make_bafe()))
     assert all_finite(gradients(features, make_bafe()))
@@ -190,8 +190,8 @@ def test_an_exponent_of_1_leaves_its_factor_as_it_is(name, index):
     np.testing.assert_allclose(images.lowlight, expected, rtol=1e-9)
 
 
-def test_without_bafe_net_a_pixel_has_exponents_of_its_own():
-    """From its own b1 and b2 alone, larger for larger ones, in the range that BAFE-Net has."""
+def test_without_bafe_net_exponents_depend_on_their_pixel_only():
+    """They rise with the pixel's own b1 and b2, and stay in BAFE-Net's range."""
     features, bafe, cfg = make_features(1, 4, 5, low=-9, high=9), make_bafe(), ModelConfig(bafe=False)
     exponents = decompose(features, bafe, cfg).attenuation
     assert ((exponents > 1) & (exponents < 10)).all()

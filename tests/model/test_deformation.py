@@ -1,4 +1,4 @@
-"""Moving and lighting the Gaussians: Eqs. 1-4 composed, dead rows, gradients."""
+"""Deforming and lighting the Gaussians: Eqs. 1-4 together, dead rows, gradients."""
 
 import dataclasses
 from functools import partial
@@ -22,7 +22,7 @@ N = 6
 
 
 @partial(jax.jit, static_argnames=("cfg", "moving"))
-def run(params, cameras, alive, bounds, cfg, extent=1.0, **options):
+def deform_jit(params, cameras, alive, bounds, cfg, extent=1.0, **options):
     return deform(Scene(params, alive, bounds, jnp.asarray(extent)), cameras, cfg, **options)
 
 
@@ -34,7 +34,7 @@ def field_and_motion(params, times, cfg):
 
 
 def initial(key):
-    """The start of everything but the Gaussians."""
+    """Initial values of everything but the Gaussians."""
     return (
         hexplane.init(key, CFG, 9),
         networks.init_heads(key, 4, CFG),
@@ -43,7 +43,7 @@ def initial(key):
     )
 
 
-def scene(seed=0):
+def random_params(seed=0):
     rng = np.random.default_rng(seed)
     draw = lambda *shape: jnp.asarray(rng.normal(0.1, 0.4, shape))
     gaussians = Gaussians(
@@ -58,12 +58,12 @@ def scene(seed=0):
     )
     shared = jax.tree.map(lambda leaf: draw(*leaf.shape), jax.eval_shape(initial, jax.random.key(0)))
     params = SceneParams(gaussians, *shared)
-    # Most factors a_j then lie on the live side of the ReLU.
+    # With this bias most factors a_j are positive before the ReLU.
     out = params.ocd.out._replace(bias=jnp.ones(9))
     return params._replace(ocd=params.ocd._replace(out=out))
 
 
-def look(seed=3, times=(0.2, 0.7)):
+def views(seed=3, times=(0.2, 0.7)):
     rng = np.random.default_rng(seed)
     viewmat = np.tile(np.eye(4), (len(times), 1, 1))
     for pose in viewmat:
@@ -73,14 +73,14 @@ def look(seed=3, times=(0.2, 0.7)):
 
 
 ALIVE = jnp.ones(N, bool)
-moved_at = partial(run, alive=ALIVE, bounds=BOUNDS, cfg=CFG, sh_degree_active=2)
+deformed = partial(deform_jit, alive=ALIVE, bounds=BOUNDS, cfg=CFG, sh_degree_active=2)
 
 
 @partial(jax.jit, static_argnames="moving")
 @partial(jax.grad, has_aux=True)
 def gradient_of_visible(params, alive, moving):
-    """As a rasterizer does: nothing of an invisible Gaussian counts."""
-    moved = moved_at(params, alive=alive, cameras=look(), moving=moving)
+    """Gradient of a sum over living Gaussians; as in a rasterizer, the others do not count."""
+    moved = deformed(params, alive=alive, cameras=views(), moving=moving)
     seen = jax.tree.map(lambda x: jnp.where(alive.reshape(1, -1, *[1] * (x.ndim - 2)), x, 0).sum(), moved)
     return sum(seen), moved
 
@@ -101,9 +101,9 @@ def plain_basis(v):
 
 @pytest.mark.parametrize("moving", [False, True])
 @pytest.mark.parametrize("active", [0, 1, 2])
-def test_illumination_is_equation_3(moving, active):
-    params, cameras = scene(), look()
-    actual = moved_at(params, cameras=cameras, moving=moving, sh_degree_active=jnp.array(active)).illumination
+def test_illumination_is_eq_3(moving, active):
+    params, cameras = random_params(), views()
+    actual = deformed(params, cameras=cameras, moving=moving, sh_degree_active=jnp.array(active)).illumination
     _, factors = field_and_motion(params, cameras.time, CFG)
     factors, gaussians = jax.tree.map(np.asarray, (factors, params.gaussians))
     expected = np.zeros((2, N))
@@ -119,10 +119,10 @@ def test_illumination_is_equation_3(moving, active):
     assert (expected > 0).any()
 
 
-def test_without_ocd_net_an_instant_is_lit_like_any_other():
-    params, cameras = scene(), look(times=(0.2, 0.7))
-    still = cameras._replace(viewmat=cameras.viewmat[:1].repeat(2, 0))
-    lit = lambda **options: moved_at(params, cameras=still, **options).illumination
+def test_without_ocd_net_illumination_does_not_depend_on_time():
+    params, cameras = random_params(), views(times=(0.2, 0.7))
+    same_camera = cameras._replace(viewmat=cameras.viewmat[:1].repeat(2, 0))
+    lit = lambda **options: deformed(params, cameras=same_camera, **options).illumination
     without = lit(cfg=dataclasses.replace(CFG, ocd=False), moving=True)
     np.testing.assert_allclose(without, lit(moving=False), rtol=1e-12)
     assert np.ptp(lit(moving=True), axis=0).max() > 1e-3
@@ -130,10 +130,10 @@ def test_without_ocd_net_an_instant_is_lit_like_any_other():
 
 @pytest.mark.parametrize("active", [0, 1, 2])
 def test_colours_without_a_decomposition_are_spherical_harmonics(active):
-    params, cameras = scene(), look()
+    params, cameras = random_params(), views()
     rest = jnp.asarray(np.random.default_rng(5).normal(0, 0.3, (N, 3, 8)))
     params = params._replace(gaussians=params.gaussians._replace(color_rest=rest))
-    actual = moved_at(params, cameras=cameras, moving=True, sh_degree_active=jnp.array(active)).reflectance
+    actual = deformed(params, cameras=cameras, moving=True, sh_degree_active=jnp.array(active)).reflectance
     for view, pose in enumerate(np.asarray(cameras.viewmat)):
         towards = np.asarray(params.gaussians.means) - np.linalg.inv(pose)[:3, 3]
         basis = np.stack([plain_basis(d / np.linalg.norm(d)) for d in towards])[:, 1 : (active + 1) ** 2]
@@ -141,19 +141,19 @@ def test_colours_without_a_decomposition_are_spherical_harmonics(active):
         np.testing.assert_allclose(actual[view], np.maximum(seen, 0), rtol=1e-9, atol=1e-12)
 
 
-def test_illumination_offset_and_floor():
-    params = scene()
+def test_illumination_has_an_offset_and_is_never_negative():
+    params = random_params()
     dark = params._replace(gaussians=params.gaussians._replace(illumination_dc=jnp.full((N, 1), -50.0)))
-    lit = lambda p, offset: (
-        moved_at(p, cameras=look(), cfg=dataclasses.replace(CFG, illumination_offset=offset), moving=False).illumination
+    lit = lambda p, value: (
+        deformed(p, cameras=views(), cfg=dataclasses.replace(CFG, illumination_offset=value), moving=False).illumination
     )
     np.testing.assert_array_equal(lit(dark, 0.5), 0)
     np.testing.assert_allclose(lit(params, 5.0) - lit(params, 4.0), 1, rtol=1e-12)
 
 
 def test_coarse_stage_is_the_canonical_scene_in_every_view():
-    params = scene()
-    g, moved = params.gaussians, moved_at(params, cameras=look(), moving=False)
+    params = random_params()
+    g, moved = params.gaussians, deformed(params, cameras=views(), moving=False)
     expected = {
         "means": g.means,
         "quats": g.quats,
@@ -166,9 +166,9 @@ def test_coarse_stage_is_the_canonical_scene_in_every_view():
         np.testing.assert_allclose(getattr(moved, name), np.stack([value, value]), rtol=1e-14, err_msg=name)
 
 
-def test_fine_stage_adds_the_heads_to_the_raw_parameters():
-    params, cameras = scene(), look()
-    g, moved = params.gaussians, moved_at(params, cameras=cameras, moving=True)
+def test_fine_stage_adds_the_outputs_of_the_heads_to_the_raw_parameters():
+    params, cameras = random_params(), views()
+    g, moved = params.gaussians, deformed(params, cameras=cameras, moving=True)
     motion, _ = field_and_motion(params, cameras.time, CFG)
     g, motion = jax.tree.map(np.asarray, (g, motion))
     np.testing.assert_allclose(moved.means, g.means[None] + motion.means, rtol=1e-12)
@@ -177,14 +177,14 @@ def test_fine_stage_adds_the_heads_to_the_raw_parameters():
     logits = g.logit_opacities[None] + motion.logit_opacities
     np.testing.assert_allclose(moved.opacities, 1 / (1 + np.exp(-logits)), rtol=1e-12)
     assert np.abs(moved.means[0] - moved.means[1]).max() > 1e-3
-    still = moved_at(params, cameras=cameras, moving=False)
+    undeformed = deformed(params, cameras=cameras, moving=False)
     for name in ("reflectance", "attenuation"):
-        np.testing.assert_array_equal(getattr(moved, name), getattr(still, name))
+        np.testing.assert_array_equal(getattr(moved, name), getattr(undeformed, name))
 
 
-def test_linear_growth_keeps_scales_from_exploding():
+def test_linear_growth_of_scales_is_1_plus_x_above_zero():
     linear = dataclasses.replace(CFG, scale_growth="linear")
-    params, cameras = scene(), look()
+    params, cameras = random_params(), views()
     scales, canonical = params.heads.scale, np.exp(np.asarray(params.gaussians.log_scales))[None]
     for size in (1.0, 100.0):
         last = scales[-1]._replace(weight=size * scales[-1].weight, bias=size * (scales[-1].bias - 0.7))
@@ -192,21 +192,21 @@ def test_linear_growth_keeps_scales_from_exploding():
         motion, _ = field_and_motion(params._replace(heads=heads), cameras.time, CFG)
         x = np.asarray(motion.log_scales)
         assert x.min() < 0 < x.max()
-        moved = moved_at(params._replace(heads=heads), cfg=linear, cameras=cameras, moving=True)
+        moved = deformed(params._replace(heads=heads), cfg=linear, cameras=cameras, moving=True)
         expected = canonical * np.where(x > 0, 1 + x, np.exp(np.minimum(x, 0)))
         np.testing.assert_allclose(moved.scales, expected, rtol=1e-12)
     scaled = lambda head: (
-        moved_at(
+        deformed(
             params._replace(heads=params.heads._replace(scale=head)), cfg=linear, cameras=cameras, moving=True
         ).scales
     )
     check_grads(scaled, (scales,), 1, ["rev"], eps=1e-6)
 
 
-def test_without_its_head_the_opacity_does_not_depend_on_time():
-    params = scene()
+def test_without_an_opacity_head_opacity_does_not_depend_on_time():
+    params = random_params()
     params = params._replace(heads=params.heads._replace(opacity=None))
-    moving, still = (moved_at(params, cameras=look(), moving=moving) for moving in (True, False))
+    moving, still = (deformed(params, cameras=views(), moving=moving) for moving in (True, False))
     np.testing.assert_array_equal(moving.opacities, still.opacities)
     assert np.any(moving.means != still.means)
 
@@ -214,13 +214,13 @@ def test_without_its_head_the_opacity_does_not_depend_on_time():
 def test_identity_start_makes_the_first_fine_step_equal_to_the_last_coarse_one():
     cfg = dataclasses.replace(CFG, identity_start=True)
     heads, ocd = networks.init_heads(jax.random.key(0), 4, cfg), networks.init_ocd(jax.random.key(0), cfg)
-    params = scene()._replace(heads=heads, ocd=ocd)
-    fine, coarse = (moved_at(params, cameras=look(), moving=moving) for moving in (True, False))
+    params = random_params()._replace(heads=heads, ocd=ocd)
+    fine, coarse = (deformed(params, cameras=views(), moving=moving) for moving in (True, False))
     jax.tree.map(np.testing.assert_array_equal, fine, coarse)
 
 
 def test_dead_rows_are_invisible_and_get_no_gradient_even_when_they_hold_garbage():
-    params, dead = scene(), np.array([False, True, False, False, True, False])
+    params, dead = random_params(), np.array([False, True, False, False, True, False])
     alive = jnp.asarray(~dead)
     fill = lambda rows: jnp.asarray(np.where(dead.reshape(-1, *[1] * (rows.ndim - 1)), np.inf, rows))
     garbage = jax.tree.map(fill, params.gaussians)
@@ -239,28 +239,28 @@ def gated(params, logits):
     return params._replace(gaussians=params.gaussians._replace(gate=jnp.asarray(np.broadcast_to(logits, N))))
 
 
-def test_the_gate_lets_as_much_of_the_motion_through_as_it_says():
-    params, cameras = scene(), look()
-    free, still = (moved_at(params, cameras=cameras, moving=moving) for moving in (True, False))
+def test_the_gate_interpolates_between_no_motion_and_full_motion():
+    params, cameras = random_params(), views()
+    ungated, undeformed = (deformed(params, cameras=cameras, moving=moving) for moving in (True, False))
     logits = np.array([40.0, -40.0, 0.0, 40.0, -40.0, 0.0])
-    moved = moved_at(gated(params, logits), cameras=cameras, moving=True)
+    moved = deformed(gated(params, logits), cameras=cameras, moving=True)
     for name in ("means", "quats"):
-        ends = [np.asarray(getattr(x, name)) for x in (still, free)]
+        ends = [np.asarray(getattr(x, name)) for x in (undeformed, ungated)]
         share = np.array([1, 0, 0.5, 1, 0, 0.5])[None, :, None]
         np.testing.assert_allclose(getattr(moved, name), (1 - share) * ends[0] + share * ends[1], atol=1e-12)
     for name in moved._fields:
-        for open_or_shut, whole in ((0, free), (1, still), (3, free), (4, still)):
-            value, expected = (getattr(x, name)[:, open_or_shut] for x in (moved, whole))
+        for row, reference in ((0, ungated), (1, undeformed), (3, ungated), (4, undeformed)):
+            value, expected = (getattr(x, name)[:, row] for x in (moved, reference))
             np.testing.assert_allclose(value, expected, atol=1e-12, err_msg=name)
 
 
-def test_the_motion_field_acts_on_those_whose_gates_are_open_widest():
-    params, cameras = scene(), look()
-    logits, wide = np.array([1.0, -3.0, 2.0, 0.5, -4.0, -1.0]), np.array([0, 2, 3])
+def test_with_a_moving_share_only_gaussians_with_the_largest_gates_move():
+    params, cameras = random_params(), views()
+    logits, largest = np.array([1.0, -3.0, 2.0, 0.5, -4.0, -1.0]), np.array([0, 2, 3])
     alive = ALIVE.at[2].set(False)
     part = dataclasses.replace(CFG, moving_share=0.5)
-    still, free, some, live, other = (
-        moved_at(gated(params, logits), cameras=cameras, moving=moving, cfg=cfg, **options)
+    undeformed, all_moving, half_moving, one_dead, with_noise = (
+        deformed(gated(params, logits), cameras=cameras, moving=moving, cfg=cfg, **options)
         for moving, cfg, options in (
             (False, CFG, {}),
             (True, CFG, {}),
@@ -270,28 +270,28 @@ def test_the_motion_field_acts_on_those_whose_gates_are_open_widest():
         )
     )
     odd = np.array([1, 3, 5])
-    for moved, rows in ((some, wide), (live, np.array([0, 3, 5])), (other, odd)):
+    for moved, rows in ((half_moving, largest), (one_dead, np.array([0, 3, 5])), (with_noise, odd)):
         rest = np.setdiff1d(np.arange(N), [*rows, 2])
         for name in ("means", "quats", "scales", "illumination"):
-            value, there, here = (np.asarray(getattr(x, name)) for x in (moved, free, still))
-            np.testing.assert_allclose(value[:, rows], there[:, rows], atol=1e-12, err_msg=name)
-            np.testing.assert_allclose(value[:, rest], here[:, rest], atol=1e-12, err_msg=name)
+            value, full, none = (np.asarray(getattr(x, name)) for x in (moved, all_moving, undeformed))
+            np.testing.assert_allclose(value[:, rows], full[:, rows], atol=1e-12, err_msg=name)
+            np.testing.assert_allclose(value[:, rest], none[:, rest], atol=1e-12, err_msg=name)
 
 
-def test_gradients_of_a_part_that_moves():
+def test_gradients_with_a_moving_share():
     part = dataclasses.replace(CFG, moving_share=0.5)
-    cameras, logits = look(), np.array([1.0, -3.0, 2.0, 0.5, -4.0, -1.0])
+    cameras, logits = views(), np.array([1.0, -3.0, 2.0, 0.5, -4.0, -1.0])
 
     def f(params):
-        return moved_at(params, cameras=cameras, moving=True, cfg=part)
+        return deformed(params, cameras=cameras, moving=True, cfg=part)
 
-    check_grads(f, (gated(scene(), logits),), 1, ["rev"], eps=1e-6)
+    check_grads(f, (gated(random_params(), logits),), 1, ["rev"], eps=1e-6)
 
 
-def test_motion_is_measured_in_the_unit_of_lengths():
-    params, cameras = scene(), look()
+def test_motion_scales_with_the_unit_of_lengths():
+    params, cameras = random_params(), views()
     offset = lambda cfg, extent: (
-        moved_at(params, cameras=cameras, cfg=cfg, extent=extent, moving=True).means - params.gaussians.means[None]
+        deformed(params, cameras=cameras, cfg=cfg, extent=extent, moving=True).means - params.gaussians.means[None]
     )
     by_depth = dataclasses.replace(CFG, unit="depth")
     np.testing.assert_allclose(offset(by_depth, 3.0), 3 * offset(CFG, 3.0), rtol=1e-9)
@@ -300,17 +300,17 @@ def test_motion_is_measured_in_the_unit_of_lengths():
 
 @pytest.mark.parametrize("moving", [False, True])
 def test_gradients(moving):
-    params, cameras = scene(), look()
+    params, cameras = random_params(), views()
 
     def f(params, viewmat, time):
-        return moved_at(params, cameras=Camera(viewmat, cameras.K, time), moving=moving)
+        return deformed(params, cameras=Camera(viewmat, cameras.K, time), moving=moving)
 
     check_grads(f, (params, cameras.viewmat, cameras.time), 1, ["rev"], eps=1e-6)
 
 
 @pytest.mark.parametrize("moving", [False, True])
-def test_finite_at_extremes(moving):
-    params, cameras = scene(), look()
+def test_extreme_inputs_give_finite_values_and_gradients(moving):
+    params, cameras = random_params(), views()
     pose = np.asarray(cameras.viewmat[0])
     means = np.array(params.gaussians.means)
     means[:4] = [1e12] * 3, [-1e12] * 3, -pose[:3, :3].T @ pose[:3, 3], [1.0] * 3
@@ -325,9 +325,9 @@ def test_finite_at_extremes(moving):
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
 
 
-def test_production_precision_stays_single():
+def test_single_precision_is_kept():
     single = lambda tree: jax.tree.map(lambda x: x.astype("float32"), tree)
-    moved = moved_at(single(scene()), bounds=BOUNDS.astype("float32"), cameras=single(look()), moving=True)
+    moved = deformed(single(random_params()), bounds=BOUNDS.astype("float32"), cameras=single(views()), moving=True)
     assert {x.dtype for x in moved} == {np.dtype("float32")}
 
 
@@ -337,22 +337,22 @@ PATHS = np.random.default_rng(2).normal(0, 0.3, (N, KNOTS, 3))
 
 
 def with_paths(times, paths=PATHS, lifetimes=LIFETIMES):
-    """The Gaussians at rest, and as they are on their paths."""
-    params, cameras = scene(), look(times=times)
+    """The Gaussians without and with paths and lifetimes."""
+    params, cameras = random_params(), views(times=times)
     gaussians = params.gaussians._replace(paths=jnp.asarray(paths), lifetimes=jnp.asarray(lifetimes))
-    rest = moved_at(params, cameras=cameras, moving=False)
-    return rest, moved_at(params._replace(gaussians=gaussians), cameras=cameras, moving=False)
+    without = deformed(params, cameras=cameras, moving=False)
+    return without, deformed(params._replace(gaussians=gaussians), cameras=cameras, moving=False)
 
 
 def test_gaussians_follow_their_paths():
     times = (0.0, 1 / 3, 0.5, 0.85, 1.0)
-    rest, moved = with_paths(times)
+    without, moved = with_paths(times)
     expected = np.einsum("vk,nkc->vnc", path_weights(jnp.asarray(times), KNOTS), PATHS)
     expected = expected * np.isfinite(LIFETIMES[:, :1])
-    np.testing.assert_allclose(moved.means - rest.means, expected, atol=1e-12)
+    np.testing.assert_allclose(moved.means - without.means, expected, atol=1e-12)
 
 
-def test_paths_are_smooth_and_pass_straight_through_evenly_spaced_points():
+def test_paths_are_smooth_and_straight_for_evenly_spaced_knots():
     times = np.linspace(0, 1, 301)
     weights = np.asarray(path_weights(jnp.asarray(times), 6))
     np.testing.assert_allclose(weights.sum(-1), 1)
@@ -363,16 +363,16 @@ def test_paths_are_smooth_and_pass_straight_through_evenly_spaced_points():
     check_grads(lambda t: path_weights(jnp.asarray(t), 6), (np.array([0.13, 0.52, 0.9]),), 1)
 
 
-def test_gaussians_come_and_go():
-    rest, moved = with_paths((0.1, 0.3, 0.45, 0.5, 0.95))
-    there = [
+def test_gaussians_fade_in_and_out_at_the_ends_of_their_lifetimes():
+    without, moved = with_paths((0.1, 0.3, 0.45, 0.5, 0.95))
+    expected = [
         [1, 0, 1, 0, 1, 1],
         [1, 1, 1, 0, 1, 1],
         [1, 1, 0.4, 0, 1, 1],
         [1, 1, 0, 0, 1, 1],
         [1, 0, 0, 0.4, 1, 1],
     ]
-    np.testing.assert_allclose(moved.opacities / rest.opacities, there, atol=1e-9)
+    np.testing.assert_allclose(moved.opacities / without.opacities, expected, atol=1e-9)
 
 
 def test_paths_and_lifetimes_carry_gradients():

@@ -1,4 +1,4 @@
-"""HexPlane against a plain bilinear lookup, its gradients, its borders and its penalties."""
+"""HexPlane: values of a plain bilinear lookup, gradients, borders of the box, and regularisers."""
 
 import dataclasses
 import itertools
@@ -62,7 +62,7 @@ def oracle(planes, points, times, cfg):
 
 
 @pytest.mark.parametrize(("aggregation", "time_range"), VARIANTS)
-def test_matches_plain_bilinear_lookup(aggregation, time_range):
+def test_features_match_a_plain_bilinear_lookup(aggregation, time_range):
     cfg, planes = variant(aggregation, time_range), random_planes()
     # Inside, at the corners, on cell borders, and outside the box on either side.
     outside = BOUNDS + np.array([[-5.0], [7.0]])
@@ -114,7 +114,7 @@ def test_a_single_point_has_features():
     np.testing.assert_allclose(actual, oracle(planes, point, TIMES, CFG), rtol=1e-12)
 
 
-def test_a_point_outside_the_box_has_no_gradient_and_nothing_breaks_far_away():
+def test_points_outside_the_box_have_finite_features_and_no_gradient():
     points = jnp.asarray(random_points()).at[:3].set(np.array([[9.0, 1.0, 2.2], [-1e30, 1e30, 1e30], [0.3, 1.0, 2.2]]))
     value = features(random_planes(), points, jnp.asarray(BOUNDS), jnp.asarray(TIMES), CFG)
     gradient = point_gradient(points, random_planes(), jnp.asarray(BOUNDS), jnp.asarray(TIMES))
@@ -135,7 +135,7 @@ def test_a_box_without_extent_along_an_axis_ignores_that_axis():
     np.testing.assert_array_equal(gradient[:, 1], 0)
 
 
-def test_times_share_nothing_but_the_planes():
+def test_features_at_one_time_do_not_depend_on_other_times():
     planes, points = random_planes(), jnp.asarray(random_points())
     both = features(planes, points, jnp.asarray(BOUNDS), jnp.asarray(TIMES), CFG)
     for view, t in enumerate(TIMES):
@@ -178,24 +178,24 @@ def test_regularisers_of_a_ramp_and_of_two_instants_are_zero():
     np.testing.assert_array_equal(hexplane.regularisers(HexPlane((ramp(4),), (ramp(2),)))[1], 0)
 
 
-def test_with_a_rim_all_of_space_has_cells_of_its_own():
+def test_with_a_rim_features_vary_outside_the_box_too():
     cfg = dataclasses.replace(CFG, box_rim=0.25)
     low, high = BOUNDS
     ramp = np.linspace(0, 1, 801)[:, None]
     inside = low + ramp * (high - low)
     planes = random_planes()
-    find = lambda points: hexplane.features(planes, jnp.asarray(points), jnp.asarray(BOUNDS), jnp.asarray(TIMES), cfg)
+    lookup = lambda points: hexplane.features(planes, jnp.asarray(points), jnp.asarray(BOUNDS), jnp.asarray(TIMES), cfg)
     middle = 0.5 * (low + high)
     shrunk = features(
         planes, jnp.asarray(middle + 0.75 * (inside - middle)), jnp.asarray(BOUNDS), jnp.asarray(TIMES), CFG
     )
-    np.testing.assert_allclose(find(inside), shrunk, rtol=1e-9)
-    rays = [middle + distance * (high - low) * np.array([[0.6, -0.7, 0.8]]) for distance in (0.5, 1, 2, 4, 1e3, 1e30)]
-    found = [np.asarray(find(point)) for point in rays]
+    np.testing.assert_allclose(lookup(inside), shrunk, rtol=1e-9)
+    outer = [middle + distance * (high - low) * np.array([[0.6, -0.7, 0.8]]) for distance in (0.5, 1, 2, 4, 1e3, 1e30)]
+    found = [np.asarray(lookup(point)) for point in outer]
     assert all(np.abs(a - b).max() > 1e-6 for a, b in itertools.pairwise(found[:-1]))
     assert all(np.isfinite(x).all() for x in found)
-    gradient = jax.grad(lambda point: find(point).sum())(jnp.asarray(rays[3]))
+    gradient = jax.grad(lambda point: lookup(point).sum())(jnp.asarray(outer[3]))
     assert np.all(gradient != 0)
     step = 1e-6 * (high - low)
-    edge = [np.asarray(find((high + k * step)[None])) for k in (-1, 0, 1)]
+    edge = [np.asarray(lookup((high + k * step)[None])) for k in (-1, 0, 1)]
     np.testing.assert_allclose(edge[2] - edge[1], edge[1] - edge[0], rtol=1e-2, atol=1e-12)

@@ -1,4 +1,4 @@
-"""How a scene starts, and how it grows."""
+"""Initial scenes, and growing their arrays."""
 
 import dataclasses
 import itertools
@@ -25,7 +25,7 @@ def initialise(cfg=CFG, colors=None, points=POINTS, **arguments):
     return initialisation.initialise(jax.random.key(0), points, colors, CAMERAS, cfg, capacity=32, **arguments)
 
 
-def test_one_gaussian_a_point_and_dead_rows_after_them():
+def test_each_point_becomes_a_gaussian_and_dead_rows_follow():
     start = initialise()
     gaussians = start.params.gaussians
     np.testing.assert_array_equal(start.alive, np.arange(32) < 20)
@@ -39,7 +39,7 @@ def test_one_gaussian_a_point_and_dead_rows_after_them():
     assert start.params.hexplane.time[0].shape[1] == len(CAMERAS.time) // 2
 
 
-def test_scales_are_the_distance_to_the_nearest_points():
+def test_scales_are_the_rms_distance_to_the_three_nearest_points():
     distances = np.linalg.norm(POINTS[:, None] - POINTS[None], axis=-1)
     nearest = np.sort(distances, axis=1)[:, 1:4]
     expected = np.sqrt(np.mean(nearest**2, axis=1))
@@ -55,7 +55,7 @@ def test_illumination_is_the_luminance_of_the_points():
 
 
 @pytest.mark.parametrize(("kind", "low"), [("uniform", 0.0), ("normal", -10.0)])
-def test_random_starts_have_their_distribution(kind, low):
+def test_random_reflectances_have_the_chosen_distribution(kind, low):
     points = np.random.default_rng(2).normal(size=(3000, 3))
     cfg = dataclasses.replace(CFG, reflectance_init=kind)
     start = initialisation.initialise(jax.random.key(0), points, None, CAMERAS, cfg, capacity=3000)
@@ -80,7 +80,7 @@ def test_every_parameter_has_a_group():
     assert groups(params).gaussians.log_scales == "scales"
 
 
-def test_the_ladder_climbs_in_steps_of_half():
+def test_capacities_grow_by_about_half_at_each_step():
     sizes = sorted({next_capacity(count) for count in range(1, 50_000, 7)})
     assert all(next_capacity(count) >= count for count in (1, 1024, 1025, 40_000))
     assert all(1.3 < b / a < 1.7 for a, b in itertools.pairwise(sizes))
@@ -96,14 +96,14 @@ def test_the_z_order_keeps_neighbours_together():
     shuffled = grid[np.random.default_rng(0).permutation(len(grid))]
     ordered = shuffled[initialisation.z_order(shuffled)]
     np.testing.assert_array_equal(np.unique(ordered, axis=0), np.unique(grid, axis=0))
-    # Every 8 and every 64 points in a row fill a cube of 2 and of 4 points an edge.
+    # Every 8 (64) consecutive points fill a cube of 2 (4) points along each edge.
     for size in (2, 4):
         cubes = ordered.reshape(-1, size**3, 3)
         np.testing.assert_array_equal(np.ptp(cubes, axis=1), size - 1)
     np.testing.assert_array_equal(initialisation.z_order(np.ones((3, 3))), np.arange(3))
 
 
-def test_the_box_leaves_out_as_many_points_as_it_should():
+def test_the_box_spans_the_middle_quantiles_of_the_points():
     points = np.random.default_rng(2).normal([0, 0, 9], 1, (31, 3)).astype(np.float32)
     points[7] = [500, -300, 90]
     bounds = initialise(dataclasses.replace(CFG, box_points=0.9), points=points).bounds
@@ -111,6 +111,6 @@ def test_the_box_leaves_out_as_many_points_as_it_should():
     assert float(np.ptp(bounds, axis=0).max()) < 10
 
 
-def test_measured_by_depth_the_extent_is_a_part_of_it():
+def test_with_unit_depth_the_extent_is_a_quarter_of_the_median_depth():
     start = initialise(dataclasses.replace(CFG, unit="depth"))
     np.testing.assert_allclose(start.extent, 0.25 * np.median(POINTS[:, 2]), rtol=1e-6)

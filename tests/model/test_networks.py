@@ -1,4 +1,4 @@
-"""Heads, OCD-Net and BAFE-Net against plain transcriptions, their gradients, their starts and their extremes."""
+"""Heads, OCD-Net and BAFE-Net: plain transcriptions, gradients, initial weights and extreme inputs."""
 
 import dataclasses
 
@@ -22,8 +22,8 @@ def size(parameters):
     return sum(leaf.size for leaf in jax.tree.leaves(parameters))
 
 
-def random(init, *settings, seed=0):
-    """Parameters of the shapes that `init` makes, every one of them drawn, biases and scales too."""
+def random_parameters(init, *settings, seed=0):
+    """Random parameters in the shapes that `init` makes, biases and scales included."""
     rng = np.random.default_rng(seed)
     shapes = jax.eval_shape(lambda: init(jax.random.key(0), *settings))
     return jax.tree.map(lambda leaf: jnp.asarray(rng.normal(0.1, 0.4, leaf.shape)), shapes)
@@ -33,7 +33,7 @@ def noise(*shape, seed=5):
     return jnp.asarray(np.random.default_rng(seed).normal(size=shape))
 
 
-def test_parameter_counts_of_the_release():
+def test_parameter_counts_are_those_of_the_released_code():
     full = ModelConfig()
     key = jax.random.key(0)
     assert size(jax.eval_shape(lambda: networks.init_ocd(key, full))) == 18_576
@@ -55,7 +55,7 @@ def test_weights_are_xavier_uniform_and_biases_zero():
 
 
 def test_heads_match_a_plain_transcription():
-    heads, features = random(networks.init_heads, 5, CFG), noise(2, 3, 5)
+    heads, features = random_parameters(networks.init_heads, 5, CFG), noise(2, 3, 5)
     relu = lambda x: np.maximum(x, 0)
     plain, features = jax.tree.map(np.asarray, (heads, features))
     hidden = features @ plain.aggregate.weight + plain.aggregate.bias
@@ -70,7 +70,7 @@ def test_heads_match_a_plain_transcription():
 
 
 def test_ocd_matches_a_plain_transcription():
-    ocd, hidden = random(networks.init_ocd, CFG), noise(7, 6)
+    ocd, hidden = random_parameters(networks.init_ocd, CFG), noise(7, 6)
     elu = lambda x: np.where(x > 0, x, np.expm1(np.minimum(x, 0)))
     plain = jax.tree.map(np.asarray, ocd)
     inner = elu(elu(np.asarray(hidden)) @ plain.hidden.weight + plain.hidden.bias)
@@ -81,19 +81,19 @@ def test_ocd_matches_a_plain_transcription():
 
 
 def test_gradients_of_heads_and_ocd():
-    heads = random(networks.init_heads, 5, CFG)
+    heads = random_parameters(networks.init_heads, 5, CFG)
     check_grads(jax.jit(networks.apply_heads), (heads, noise(2, 5)), 1, ["fwd", "rev"])
-    ocd = random(networks.init_ocd, CFG)
+    ocd = random_parameters(networks.init_ocd, CFG)
     check_grads(jax.jit(networks.apply_ocd), (ocd, noise(3, 6)), 1, ["fwd", "rev"])
 
 
-def test_identity_start_is_no_motion_and_factor_one_and_can_learn():
+def test_identity_start_gives_no_motion_and_factors_of_one_and_can_learn():
     features = noise(4, 5)
     heads, ocd = networks.init_heads(jax.random.key(0), 5, IDENTITY), networks.init_ocd(jax.random.key(1), IDENTITY)
     hidden, motion = networks.apply_heads(heads, features)
     assert np.abs(hidden).max() > 0
-    for moved in motion:
-        np.testing.assert_array_equal(moved, 0)
+    for offset in motion:
+        np.testing.assert_array_equal(offset, 0)
     np.testing.assert_array_equal(networks.apply_ocd(ocd, hidden), 1)
     gradients = jax.jit(jax.grad(lambda h: sum(x.sum() for x in jax.tree.leaves(networks.apply_heads(h, features)))))(
         heads
@@ -107,7 +107,7 @@ def test_identity_start_is_no_motion_and_factor_one_and_can_learn():
 
 
 def plain_bafe(bafe, attenuation):
-    """BAFE-Net of one image by loops over the kernel."""
+    """BAFE-Net on one image, with loops over the kernel."""
 
     def conv(layer, x):
         k, (h, w) = len(layer.weight), x.shape[:2]
@@ -131,7 +131,7 @@ def plain_bafe(bafe, attenuation):
 
 
 def test_bafe_matches_a_plain_transcription_image_by_image():
-    bafe, images = random(networks.init_bafe, None), noise(2, 7, 9, 2)
+    bafe, images = random_parameters(networks.init_bafe, None), noise(2, 7, 9, 2)
     actual = apply_bafe(bafe, images)
     for image, exponents in zip(images, actual, strict=True):
         np.testing.assert_allclose(exponents, plain_bafe(bafe, np.asarray(image)), rtol=1e-9)
@@ -139,12 +139,12 @@ def test_bafe_matches_a_plain_transcription_image_by_image():
 
 
 def test_gradients_of_bafe():
-    bafe = random(networks.init_bafe, None)
+    bafe = random_parameters(networks.init_bafe, None)
     check_grads(apply_bafe, (bafe, noise(2, 4, 5, 2)), 1, ["fwd", "rev"], eps=1e-6)
 
 
 @pytest.mark.parametrize("exponents", [(1.05, 9.0), (5.5, 5.5), (9.999, 1.001)])
-def test_initial_exponents_are_where_training_starts(exponents):
+def test_bafe_net_initially_returns_the_initial_exponents(exponents):
     bafe = networks.init_bafe(jax.random.key(0), jnp.asarray(networks.exponent_bias(exponents)))
     np.testing.assert_allclose(apply_bafe(bafe, noise(2, 4, 5, 2)), np.tile(exponents, (2, 4, 5, 1)), rtol=1e-12)
     gradient = bafe_value_and_grad(bafe, noise(4, 5, 2))[1][0]
@@ -166,7 +166,7 @@ def test_impossible_initial_exponents_are_refused(exponents):
 
 @pytest.mark.parametrize("image", [np.zeros((4, 5, 2)), np.full((4, 5, 2), 1e30), np.ones((1, 1, 2))])
 def test_bafe_is_finite_at_extremes(image):
-    bafe = random(networks.init_bafe, None)
+    bafe = random_parameters(networks.init_bafe, None)
     value, gradients = jax.value_and_grad(lambda p, x: networks.apply_bafe(p, x).sum(), (0, 1))(
         bafe, jnp.asarray(image)
     )

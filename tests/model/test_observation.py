@@ -1,4 +1,4 @@
-"""What the frames show at the points."""
+"""Colours and exposures observed at the points."""
 
 import numpy as np
 import pytest
@@ -10,10 +10,10 @@ from l2dgs_jax.model import observation
 def test_observed_colors_are_those_of_the_pixels_that_points_project_to():
     images = np.random.default_rng(3).uniform(size=(4, 12, 16, 3))
     images[1:] = images[:1]
-    still = cameras([[0, 0, 0]] * 4)
+    same_camera = cameras([[0, 0, 0]] * 4)
     point_in_pixel = lambda column, row, z: [(column + 0.5 - 8) / 10 * z, (row + 0.5 - 6) / 10 * z, z]
     points = np.array([point_in_pixel(3, 5, 2.0), point_in_pixel(15, 11, 3.0), [0, 0, -1], [100, 0, 1]])
-    colors = observation.observed_colors(points, still, images)
+    colors = observation.observed_colors(points, same_camera, images)
     np.testing.assert_allclose(colors[0], images[0, 5, 3], rtol=1e-6)
     np.testing.assert_allclose(colors[1], images[0, 11, 15], rtol=1e-6)
     np.testing.assert_allclose(colors[2:], np.tile(images.mean((0, 1, 2)), (2, 1)), rtol=1e-6)
@@ -37,7 +37,7 @@ def test_observed_colors_are_the_same_when_few_are_held_at_once(monkeypatch, at_
     local = np.einsum("fij,pj->fpi", spread.viewmat[:, :3, :3], POINTS) + spread.viewmat[:, None, :3, 3]
     pixels = np.floor(np.einsum("fij,fpj->fpi", spread.K, local) / np.where(local[..., 2:] > 0, local[..., 2:], np.inf))
     mean = images.mean((0, 1, 2), np.float64, where=valid[..., None]).astype(np.float32)
-    some_seen = 0
+    seen_more_than_once = 0
     for point, color in enumerate(colors):
         seen = [
             images[frame, int(row), int(column)].astype(np.float32)
@@ -46,9 +46,9 @@ def test_observed_colors_are_the_same_when_few_are_held_at_once(monkeypatch, at_
             and (0 <= column < 16 and 0 <= row < 12)
             and valid[frame, int(row), int(column)]
         ]
-        some_seen += len(seen) > 1
+        seen_more_than_once += len(seen) > 1
         np.testing.assert_array_equal(color, np.median(seen, axis=0) if seen else mean)
-    assert 5 < some_seen < len(POINTS)
+    assert 5 < seen_more_than_once < len(POINTS)
 
 
 def wall(frames, gains):
@@ -67,7 +67,7 @@ def test_exposures_are_the_gains_of_the_frames():
     np.testing.assert_allclose(found.mean(0), 0, atol=1e-6)
 
 
-def test_frames_that_tell_nothing_of_their_exposure_have_none():
+def test_frames_without_observations_have_no_exposure_gain():
     images, valid = wall(4, np.full((4, 3), 0.1)), np.ones((4, 12, 16), bool)
     images[2] *= 1.4
     valid[2] = False

@@ -12,7 +12,7 @@ def unit_vectors(count, seed=0):
     return jnp.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
 
 
-def test_matches_the_polynomials_of_3dgs():
+def test_the_basis_matches_the_polynomials_of_3dgs():
     directions = unit_vectors(50)
     x, y, z = np.asarray(directions).T
     c1, c2, c3 = np.sqrt(3 / np.pi) / 2, np.sqrt(15 / np.pi) / 2, np.sqrt(7 / np.pi) / 4
@@ -32,7 +32,7 @@ def test_matches_the_polynomials_of_3dgs():
     np.testing.assert_allclose(sh.basis(directions, 3), np.stack(expected, axis=-1), atol=1e-12)
 
 
-def test_is_orthonormal_over_the_sphere():
+def test_the_basis_is_orthonormal_over_the_sphere():
     cosines, weights = np.polynomial.legendre.leggauss(8)
     azimuths = np.arange(16) * 2 * np.pi / 16
     z, phi = (grid.ravel() for grid in np.meshgrid(cosines, azimuths, indexing="ij"))
@@ -43,7 +43,7 @@ def test_is_orthonormal_over_the_sphere():
 
 
 @pytest.mark.parametrize("degree", [0, 1, 3])
-def test_gradients(degree):
+def test_gradients_of_the_basis(degree):
     check_grads(jax.jit(lambda d: sh.basis(d, degree)), (unit_vectors(4),), order=1, modes=("fwd", "rev"))
 
 
@@ -52,18 +52,18 @@ def test_gradients_of_directions():
     check_grads(jax.jit(sh.directions), (means, jnp.array([0.1, 0.2, 0.3])), order=1, modes=("fwd", "rev"))
 
 
-def test_a_gaussian_at_the_camera_is_harmless():
+def test_a_gaussian_at_the_camera_has_finite_gradients():
     means = jnp.array([[1.0, 2.0, 3.0], [1.0, 2.0, 4.0]])
     total = lambda m: jnp.sum(sh.basis(sh.directions(m, m[0]), 3))
     assert jnp.all(sh.directions(means, means[0])[0] == 0)
     assert jnp.all(jnp.isfinite(jax.grad(total)(means)))
 
 
-def test_batches_of_views():
+def test_batches_of_views_equal_single_views():
     means, centres = unit_vectors(6).reshape(2, 3, 3), unit_vectors(2, seed=1)
     together = sh.basis(sh.directions(means, centres), 2)
-    apart = jnp.stack([sh.basis(sh.directions(m, c), 2) for m, c in zip(means, centres, strict=True)])
-    np.testing.assert_array_equal(together, apart)
+    alone = jnp.stack([sh.basis(sh.directions(m, c), 2) for m, c in zip(means, centres, strict=True)])
+    np.testing.assert_array_equal(together, alone)
 
 
 def test_a_negative_degree_is_refused():

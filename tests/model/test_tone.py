@@ -1,4 +1,4 @@
-"""The darkening law against the images that it describes."""
+"""The darkening law, compared with the images that it describes."""
 
 import itertools
 
@@ -21,12 +21,12 @@ def test_transfer_functions_are_inverse_and_agree_with_scikit_image():
 
 
 @pytest.mark.parametrize("exposure", [0.03, 0.1, 0.4])
-def test_it_describes_an_underexposed_image(exposure):
+def test_the_law_describes_an_underexposed_image(exposure):
     lit = np.random.default_rng(0).beta(2, 2.3, 10_000)
     dark = linear_to_srgb(exposure * srgb_to_linear(lit))
     exponent, gain, _ = darkening(dark.mean(), lit.mean())
     law = gain * lit**exponent
-    # A gain alone is the law that the exponent must beat.
+    # With its exponent the law must be closer than a gain alone.
     gain_only = lit * (dark @ lit) / (lit @ lit)
     assert np.mean((law - dark) ** 2) < 0.6 * np.mean((gain_only - dark) ** 2)
     assert 1 < exponent < 2
@@ -43,13 +43,13 @@ def test_a_bright_image_is_left_almost_as_it_is():
     assert law.gain == pytest.approx(1.0, abs=0.02)
 
 
-def test_a_gain_is_a_law_of_the_least_exponent():
+def test_a_gain_is_a_law_with_the_smallest_exponent():
     exponent, gain, _ = darkening(0.07, 0.46, "gain")
     assert exponent == pytest.approx(1.01)
     assert gain * 0.46**exponent == pytest.approx(0.07)
 
 
-def test_of_light_it_is_nearly_a_gain_and_can_be_undone():
+def test_in_linear_light_the_law_is_nearly_a_gain_and_invertible():
     law = darkening(0.07, 0.46, of_light=True)
     assert law.exponent == pytest.approx(1.01)
     values = np.linspace(0, 1, 11)
@@ -78,12 +78,12 @@ def eight_bits(image):
     return (np.round(255 * np.clip(image, 0, 1)) / 255).astype(np.float16)
 
 
-def test_clean_flat_frames_were_darkened_by_a_gain():
+def test_clean_frames_of_low_contrast_are_recognised_as_darkened_by_a_gain():
     well = photographs(contrast=0.4)
     assert recognise(eight_bits(0.16 * well)) == "gain"
 
 
-def test_noise_or_contrast_tell_little_light():
+def test_frames_with_noise_or_contrast_are_recognised_as_linear_light():
     well, rng = photographs(contrast=0.4), np.random.default_rng(8)
     dim = linear_to_srgb(0.03 * srgb_to_linear(well))
     assert recognise(eight_bits(dim)) == "linear-light"
@@ -91,7 +91,7 @@ def test_noise_or_contrast_tell_little_light():
     assert recognise(eight_bits(noisy)) == "linear-light"
 
 
-def test_only_pixels_that_count_tell():
+def test_recognition_uses_valid_pixels_only():
     frames = eight_bits(0.16 * photographs(contrast=0.4))
     frames[:, :, 64:] = np.random.default_rng(9).uniform(0, 1, (3, 96, 64, 3))
     valid = np.ones(frames.shape[:3], bool)
@@ -105,12 +105,12 @@ def lit(frames, of_light=True, valid=None):
 
 
 @pytest.mark.parametrize("of_light", [True, False])
-def test_frames_without_highlights_come_to_mid_grey(of_light):
+def test_frames_without_highlights_are_lit_to_mid_grey(of_light):
     frames = 0.2 * photographs(contrast=0.2)
     assert lit(frames, of_light) == pytest.approx(0.46)
 
 
-def test_the_level_gives_way_for_highlights():
+def test_the_lit_level_is_lowered_for_highlights():
     frames = linear_to_srgb(0.05 * srgb_to_linear(photographs(contrast=0.6)))
     level = lit(frames)
     assert 0.34 < level < 0.45
@@ -118,7 +118,7 @@ def test_the_level_gives_way_for_highlights():
     assert np.quantile(undone.max(-1), 0.98) == pytest.approx(0.9, abs=0.01)
 
 
-def test_the_level_gives_way_by_a_stop_at_most():
+def test_the_lit_level_is_lowered_by_at_most_one_stop():
     frames = 0.1 * photographs(contrast=0.4)
     frames[:, :24, :24] = 1.0
     level = lit(frames)

@@ -52,7 +52,7 @@ NAMES = {
 
 
 @pytest.mark.parametrize("case", NAMES)
-def test_numbers_of_pictures_in_a_folder(tmp_path, case):
+def test_pictures_of_a_folder_are_numbered_by_name(tmp_path, case):
     names, numbers = NAMES[case]
     for i, name in enumerate(names):
         write_image(tmp_path / name, random_image(i))
@@ -87,7 +87,7 @@ def test_frames_of_a_video_keep_their_pixels_and_instants(tmp_path):
         np.testing.assert_array_equal(images.to_bytes(images.read_image(tmp_path / found[i].name)), pictures[i])
 
 
-def test_video_is_turned_upright(tmp_path):
+def test_a_rotated_video_is_turned_upright(tmp_path):
     path = tmp_path / "phone.mp4"
     clips.write_video(path, [images.to_bytes(random_image(i, (32, 64, 3))) for i in range(3)], "mp4v")
     content = bytearray(path.read_bytes())
@@ -108,14 +108,14 @@ def test_brightening_keeps_the_order_of_levels_and_the_size():
 
 
 @pytest.mark.parametrize("light", [0.02, 0.1, 0.5, 1.0])
-def test_clips_of_any_darkness_come_out_alike(light):
+def test_clips_of_any_darkness_are_brightened_alike(light):
     image = light * random_image() ** 2
     tone = brighten.tone_for([image])
     assert 0.25 < brighten.brighten(image, tone).mean() / 255 < 0.5
     assert (tone.smoothing > 0) == (light < 0.8)
 
 
-def test_well_lit_clips_stay_as_they_are():
+def test_well_lit_clips_are_not_changed():
     image = np.repeat(0.2 + 0.8 * random_image()[..., :1], 3, axis=-1)
     tone = brighten.tone_for([image])
     assert tone == (1.0, 1.0, 0.0)
@@ -127,18 +127,18 @@ def grey_clip(count, **options):
     return [motion.small(brighten.brighten(p, brighten.tone_for(pictures))) for p in pictures], squares
 
 
-def test_what_moves_is_found_and_what_stands_is_not():
+def test_moving_regions_are_found_and_static_ones_are_not():
     pictures, squares = grey_clip(15, reach=0.4, light=0.3)
     masks = list(motion.moving_regions(pictures))
     found = np.mean([(mask & square).sum() / square.sum() for mask, square in zip(masks, squares, strict=True)])
     wrong = np.mean([mask[~square].mean() for mask, square in zip(masks, squares, strict=True)])
     assert found > 0.8
     assert wrong < 0.1
-    still = motion.moving_regions(grey_clip(15, reach=0.4, light=0.3, block=False)[0])
-    assert np.mean([mask.mean() for mask in still]) < 0.05
+    without_square = motion.moving_regions(grey_clip(15, reach=0.4, light=0.3, block=False)[0])
+    assert np.mean([mask.mean() for mask in without_square]) < 0.05
 
 
-def test_shift_of_camera_not_of_objects():
+def test_camera_shift_is_that_of_the_camera_not_of_objects():
     assert motion.camera_shift(grey_clip(6, reach=0.0, light=0.1)[0]) < 0.5 * motion.STILL_BELOW
     assert motion.camera_shift(grey_clip(6, reach=0.05, light=0.1)[0]) > 2 * motion.STILL_BELOW
     assert motion.camera_shift([np.zeros((20, 20), np.uint8)]) == 0

@@ -1,4 +1,4 @@
-"""The curve network against hand-computed cases and a plain transcription; its losses and their gradients."""
+"""The curve network compared with hand-computed cases and a plain transcription; losses and their gradients."""
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +16,7 @@ loss_and_gradients = jax.jit(jax.value_and_grad(curve_network.loss))
 
 
 def network(seed=0, width=WIDTH):
-    """Parameters of the shapes that `init` makes, every one of them drawn."""
+    """Random parameters in the shapes that `init` makes."""
     rng = np.random.default_rng(seed)
     shapes = jax.eval_shape(lambda: curve_network.init(jax.random.key(0), width))
     return jax.tree.map(lambda leaf: jnp.asarray(rng.normal(0.05, 0.25, leaf.shape)), shapes)
@@ -41,16 +41,16 @@ def images(*shape, seed=1):
         (1.0, [0.7] * 10, 1.0),
     ],
 )
-def test_curve_by_hand(lightness, curves, expected):
+def test_curves_match_values_computed_by_hand(lightness, curves, expected):
     result = curve_network.iterate(jnp.asarray(lightness), jnp.asarray(curves, float))
     np.testing.assert_allclose(result, expected, rtol=1e-12, atol=0)
 
 
-def test_curve_stays_in_range_and_its_sign_says_which_way():
+def test_curves_stay_in_range_and_darken_or_brighten_by_their_sign():
     rng = np.random.default_rng(0)
     lightness, curves = rng.uniform(0, 1, 500), rng.uniform(-1, 1, (500, 10))
-    anyway = curve_network.iterate(jnp.asarray(lightness), jnp.asarray(curves))
-    assert np.all((anyway >= 0) & (anyway <= 1))
+    mixed = curve_network.iterate(jnp.asarray(lightness), jnp.asarray(curves))
+    assert np.all((mixed >= 0) & (mixed <= 1))
     assert np.all(curve_network.iterate(jnp.asarray(lightness), jnp.asarray(np.abs(curves))) <= lightness)
     assert np.all(curve_network.iterate(jnp.asarray(lightness), jnp.asarray(-np.abs(curves))) >= lightness)
 
@@ -65,14 +65,14 @@ def test_a_network_of_zeros_gives_its_last_bias():
     )
 
 
-def test_one_path_through_the_network_by_hand():
+def test_one_path_through_the_network_matches_a_formula():
     """Middle taps of single channels carry 2 x and 3 e to the first curve: tanh(2 x - 3 e) where both are positive."""
     zeros = jax.tree.map(lambda leaf: np.zeros(leaf.shape), network())
     for layer in zeros.exposure + zeros.image[:4]:
         layer.weight[1, 1, 0, 0] = 1
     zeros.image[0].weight[1, 1, 0, 0] = 2
     zeros.exposure[0].weight[1, 1, 0, 0] = 3
-    zeros.image[6].weight[1, 1, WIDTH, 0] = 1  # reads the second exposure layer, the first image layer, the sixth
+    zeros.image[6].weight[1, 1, WIDTH, 0] = 1  # its inputs: exposure layer 2, image layers 1 and 6
     zeros.image[6].weight[1, 1, 0, 0] = -1
     lightness, exposure = images(4, 5)
     result = curves(jax.tree.map(jnp.asarray, zeros), lightness, exposure)
@@ -117,7 +117,7 @@ def test_released_width_has_the_released_number_of_parameters():
     assert sum(leaf.size for leaf in jax.tree.leaves(shapes)) == 7_154_186
 
 
-def test_losses_by_hand():
+def test_losses_match_values_computed_by_hand():
     ones = jnp.ones((1, 8, 8))
     np.testing.assert_allclose(curve_network.exposure_loss(0.2 * ones, 0.5 * ones), 0.3)
     both = jnp.concatenate([0.2 * ones, 0.6 * ones])

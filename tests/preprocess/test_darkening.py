@@ -12,7 +12,7 @@ def picture(seed=0, low=0.0, high=1.0):
 
 
 def constant(value):
-    """A darkener that wants the same lightness everywhere."""
+    """A darkener that returns the same lightness everywhere."""
     return lambda light, _: np.full_like(light, value)
 
 
@@ -38,18 +38,18 @@ def test_the_ratio_of_lightness_scales_every_channel():
     np.testing.assert_allclose(darkening.darken(image, 0.1, constant(0.1), "lednet"), swapped, rtol=1e-5)
 
 
-def test_the_darkener_sees_lightness_and_exposure_map():
+def test_the_darkener_is_given_lightness_and_exposure_map():
     image = picture()
     image[0, 0] = 1
-    seen = []
-    darkening.darken(image, 0.2, lambda *planes: seen.append(planes) or planes[0], "correct")
-    ((light, exposure),) = seen
+    calls = []
+    darkening.darken(image, 0.2, lambda *planes: calls.append(planes) or planes[0], "correct")
+    ((light, exposure),) = calls
     np.testing.assert_array_equal(light, darkening.lightness(image))
     assert exposure[0, 0] == light[0, 0] == 1
     assert exposure[1, 1] == np.float32(0.2)
 
 
-def test_nothing_is_brightened_unless_asked_for():
+def test_nothing_is_brightened_unless_allowed():
     image = picture()
     image[:5] = 0
     np.testing.assert_array_equal(darkening.darken(image, 0.2, constant(0.9), "correct") <= image, True)
@@ -81,7 +81,7 @@ def test_analytic_curve_is_a_scale_that_keeps_highlights_and_order(exposure):
 
 
 @pytest.mark.parametrize("level", [0.2, 0.0, 1.0])
-def test_analytic_curve_leaves_what_is_dark_or_saturated(level):
+def test_analytic_curve_leaves_dark_and_saturated_images_unchanged(level):
     light = np.full((3, 4), level, np.float32)
     np.testing.assert_array_equal(darkening.analytic_darkener(light.ravel(), 0.3)(light, light), light)
 

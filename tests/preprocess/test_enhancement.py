@@ -1,4 +1,4 @@
-"""Frames brightened before training: brighter, in range, the held-out ones left alone; Zero-DCE by hand."""
+"""Frames brightened before training: brighter, in range, held-out ones unchanged; Zero-DCE by hand."""
 
 import dataclasses
 
@@ -19,7 +19,7 @@ def dataset():
 
 
 @pytest.mark.parametrize("method", ["gamma", "clahe", "zero-dce"])
-def test_training_frames_are_brighter_and_the_others_as_they_were(dataset, method, monkeypatch):
+def test_training_frames_are_brightened_and_held_out_ones_unchanged(dataset, method, monkeypatch):
     monkeypatch.setattr(zero_dce, "STEPS", 3)
     monkeypatch.setattr(zero_dce, "RATES", (1e-2, 1e-2))
     bright = enhanced(dataset, method)
@@ -34,7 +34,7 @@ def test_training_frames_are_brighter_and_the_others_as_they_were(dataset, metho
     assert enhanced(dataset, "none") is dataset
 
 
-def test_a_gamma_is_one_exponent_that_brings_even_frames_to_mid_grey(dataset):
+def test_gamma_brings_uniform_frames_to_mid_grey(dataset):
     flat = dataclasses.replace(dataset.train, images=np.full_like(dataset.train.images, 0.05))
     images = enhanced(dataclasses.replace(dataset, train=flat), "gamma").train.images
     np.testing.assert_allclose(images, enhancement.TARGET_MEAN, rtol=2e-3)
@@ -51,8 +51,8 @@ def test_zero_dce_has_the_parameters_and_the_curve_of_its_paper():
     np.testing.assert_allclose(zero_dce.brighten(net, images), expected, rtol=1e-12)
 
 
-def test_zero_dces_objective_by_hand():
-    """With all parameters 0 the picture stays as it is, and only exposure and tint count."""
+def test_the_objective_of_zero_dce_matches_a_value_computed_by_hand():
+    """With all parameters 0 the picture is unchanged, and only the terms of exposure and tint remain."""
     net = jax.tree.map(jnp.zeros_like, zero_dce.init(jax.random.key(0)))
     images = jnp.broadcast_to(jnp.asarray([0.1, 0.2, 0.4]), (2, 16, 16, 3))
     tint = 0.1**2 + 0.2**2 + 0.3**2

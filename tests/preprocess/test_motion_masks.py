@@ -1,4 +1,4 @@
-"""What moves before a moving camera, in videos that are exactly known."""
+"""Masks of what moves in front of a moving camera, in videos with known masks."""
 
 import functools
 
@@ -11,7 +11,7 @@ from l2dgs_jax.errors import UserError
 from l2dgs_jax.preprocess.motion_masks.detection import moving_masks, partners, segmented
 from l2dgs_jax.types import Camera
 
-ACROSS, ALONG = (0.0, 0.09), (0.09, 0.0)  # the camera's own path: the board moves 3 pixels from frame to frame
+ACROSS, ALONG = (0.0, 0.09), (0.09, 0.0)  # to the camera's path; the board moves 3 pixels from frame to frame
 
 
 def masks(film):
@@ -28,7 +28,7 @@ def iou(first, second):
     return (first & second).sum() / (first | second).sum()
 
 
-def test_nothing_moves_in_a_still_scene_however_the_camera_does():
+def test_masks_of_a_static_scene_are_empty_though_the_camera_moves():
     assert masks_of().mean() < 0.01
 
 
@@ -40,12 +40,12 @@ def test_a_moving_board_is_found(direction):
     assert min(iou(*pair) for pair in zip(found, film.truth, strict=True)) > 0.5
 
 
-def test_a_still_camera_sees_motion_too():
-    still = {"motion": ALONG, "shift": 0.0}
-    assert iou(masks_of(**still), video(**still).truth) > 0.7
+def test_motion_in_front_of_a_static_camera_is_found():
+    settings = {"motion": ALONG, "shift": 0.0}
+    assert iou(masks_of(**settings), video(**settings).truth) > 0.7
 
 
-def test_units_of_the_world_and_exposure_do_not_matter():
+def test_masks_do_not_depend_on_units_of_the_world_or_exposure():
     film, expected = video(motion=ACROSS), masks_of(motion=ACROSS)
     viewmat = film.cameras.viewmat.copy()
     viewmat[:, :3, 3] *= 1000
@@ -55,14 +55,14 @@ def test_units_of_the_world_and_exposure_do_not_matter():
     assert iou(masks(darker), expected) > 0.95
 
 
-def test_order_of_the_frames_does_not_matter():
+def test_masks_do_not_depend_on_the_order_of_frames():
     film, expected = video(motion=ACROSS), masks_of(motion=ACROSS)
     order = np.random.default_rng(0).permutation(len(film.images))
     shuffled = film._replace(cameras=Camera(*(x[order] for x in film.cameras)), images=film.images[order])
     assert np.array_equal(masks(shuffled), expected[order])
 
 
-def test_one_instant_is_refused():
+def test_frames_of_a_single_instant_are_refused():
     film = video(frames=2)
     with pytest.raises(UserError, match="one instant; expected frames of at least two"):
         masks(film._replace(cameras=film.cameras._replace(time=np.zeros(2))))
@@ -89,17 +89,17 @@ def test_partners_are_near_views_on_both_sides_and_one_of_the_same_instant():
 
 
 def test_flow_that_leaves_the_picture_or_does_not_return_is_no_match():
-    there, back = np.zeros((6, 8, 2), np.float32), np.zeros((6, 8, 2), np.float32)
-    there[..., 0], back[..., 0] = 2, -2
-    back[3, 5] = (0, 0)
-    matches = match(there, back)
+    forward, backward = np.zeros((6, 8, 2), np.float32), np.zeros((6, 8, 2), np.float32)
+    forward[..., 0], backward[..., 0] = 2, -2
+    backward[3, 5] = (0, 0)
+    matches = match(forward, backward)
     np.testing.assert_allclose(matches.positions[2, 1], [3.5, 2.5])
     assert matches.errors[3, 3] == 2
     assert (matches.errors[:, 6:] > LOST).all()
     assert matches.errors[:, :6].sum() == 2
 
 
-def test_specks_go_and_pinholes_close():
+def test_specks_are_removed_and_pinholes_closed():
     score = np.zeros((60, 80), np.float32)
     score[20:40, 20:50] = 1
     score[30, 30] = 0

@@ -35,7 +35,7 @@ def assert_same(a, b, **tolerance):
 
 @pytest.mark.parametrize("legacy", [False, True], ids=["zip", "legacy"])
 @pytest.mark.parametrize("dtype", ["float16", "float32", "float64"])
-def test_files_of_pytorch(tmp_path, legacy, dtype):
+def test_files_of_pytorch_are_read(tmp_path, legacy, dtype):
     path = tmp_path / "ce_zerodce.pth"
     path.write_bytes(saved(released(network(), dtype), legacy=legacy))
     assert_same(weights.load(path), network(), rtol=1e-3 if dtype == "float16" else 1e-7, atol=1e-6)
@@ -84,9 +84,9 @@ def test_other_networks_are_refused(tmp_path, suffix, state, message):
 
 
 def test_damaged_and_missing_files_are_refused(tmp_path):
-    whole = tmp_path / "whole.npz"
-    weights.save(whole, network())
-    content = whole.read_bytes()
+    intact = tmp_path / "whole.npz"
+    weights.save(intact, network())
+    content = intact.read_bytes()
     for kept in (0, 30, len(content) // 2, len(content) - 10):
         (tmp_path / "cut.npz").write_bytes(content[:kept])
         with pytest.raises(UserError, match=r"cut.npz: .* expected weights of a curve network"):

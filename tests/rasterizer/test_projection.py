@@ -15,17 +15,17 @@ NAMES = ("means", "quats", "scales", "viewmat", "K")
 
 @pytest.fixture(scope="module")
 def scene():
-    """Six Gaussians before a camera that looks askew; some lie outside the image, where the Jacobian is clamped."""
+    """Six Gaussians in front of a rotated camera; some lie outside the image, where the Jacobian is clamped."""
     random = np.random.default_rng(3)
     turn = np.asarray(rotations(jnp.asarray(random.normal(size=(1, 4))))[..., 0])
     viewmat = np.eye(4)
     viewmat[:3, :3], viewmat[:3, 3] = turn, [0.1, -0.2, 0.3]
-    seen = np.concatenate(
+    local = np.concatenate(
         [random.uniform(-1, 1, (6, 2)) * np.array([[0.5]] * 4 + [[4.0]] * 2), np.full((6, 1), 2.5)], 1
     )
     K = np.array([[30.0, 0, 17], [0, 33, 11], [0, 0, 1]])
     arrays = (
-        (seen - viewmat[:3, 3]) @ turn,
+        (local - viewmat[:3, 3]) @ turn,
         random.normal(size=(6, 4)),
         random.uniform(0.05, 0.4, (6, 3)),
         viewmat,
@@ -38,7 +38,7 @@ view = partial(project, width=32, height=20)
 outputs = jax.jit(lambda *arrays: view(*arrays)[:4])
 
 
-def test_matches_the_golden_scene():
+def test_projections_match_the_golden_scene():
     golden = np.load(GOLDEN / "s2000_160x96.npz")
     arrays = [jnp.asarray(golden[f"in_{name}"], jnp.float64) for name in NAMES]
     projected = project(*arrays, int(golden["in_width"]), int(golden["in_height"]))
@@ -49,7 +49,7 @@ def test_matches_the_golden_scene():
         np.testing.assert_allclose(np.asarray(getattr(projected, name))[seen], golden[f"out_{name}"][seen], rtol=1e-9)
 
 
-def test_covariance_is_the_pinhole_map_linearised(scene):
+def test_covariance_is_projected_by_the_linearised_pinhole_map(scene):
     means, quats, scales, viewmat, K = (x[:4] if x.shape[0] == 6 else x for x in scene)
     projected = view(means, quats, scales, viewmat, K)
 
@@ -68,7 +68,7 @@ def test_covariance_is_the_pinhole_map_linearised(scene):
     np.testing.assert_allclose(conics @ expected, np.tile(np.eye(2), (4, 1, 1)), atol=1e-10)
 
 
-def test_rotations_are_rotations_whatever_the_norm(scene):
+def test_rotations_do_not_depend_on_the_norm_of_quaternions(scene):
     quats = scene[1]
     turned = jnp.moveaxis(rotations(quats), -1, 0)
     np.testing.assert_allclose(turned @ jnp.swapaxes(turned, 1, 2), np.tile(np.eye(3), (6, 1, 1)), atol=1e-12)
@@ -82,7 +82,7 @@ def test_gradients(scene):
     check_grads(outputs, scene, order=1, modes=("rev",))
 
 
-def test_extremes_are_finite(scene):
+def test_extreme_inputs_give_finite_values_and_gradients(scene):
     means, quats, scales, viewmat, K = (x.astype(jnp.float32) for x in scene)
     centre = -viewmat[:3, :3].T @ viewmat[:3, 3]
     forward = viewmat[2, :3]

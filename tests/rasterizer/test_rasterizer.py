@@ -12,7 +12,7 @@ from l2dgs_jax.rasterizer import rasterize
 from l2dgs_jax.rasterizer.reference import rasterize_dense
 
 GOLDEN = Path(__file__).parent / "golden"
-# The other forms take a compilation each: their differences show in tests/kernels, and here at length.
+# Each other form takes another compilation: tests/kernels compare all forms, and these only the slow tests.
 ACCELERATOR = pytest.param("accelerator", marks=pytest.mark.slow)
 REFERENCE = pytest.param("reference", marks=pytest.mark.slow)
 NAMES = ("means", "quats", "scales", "opacities", "features", "viewmat", "K")
@@ -42,8 +42,8 @@ def stacked(seeds):
     return tuple(jnp.stack(x) for x in zip(*(scene(seed) for seed in seeds), strict=True))
 
 
-def weigh(values, seed=9):
-    """A loss that sees every entry of a view differently, and every view alike."""
+def weighted_loss(values, seed=9):
+    """A loss with random weights: different for the entries of a view, the same for all views."""
     random = np.random.default_rng(seed)
     noise = [random.normal(size=x.shape[values[1].ndim - 2 :]).astype(x.dtype) for x in values]
     return sum(jnp.sum(x * jnp.broadcast_to(w, x.shape)) for x, w in zip(values, noise, strict=True))
@@ -55,11 +55,11 @@ def images(*arrays, width=WIDTH, height=HEIGHT):
 
 
 def with_gradients(draw):
-    """The images that `draw` makes and the gradients of their loss in every array, compiled."""
+    """A compiled function of the images from `draw` and the gradients of their loss by every array."""
 
     @partial(jax.jit, static_argnames=("width", "height"))
     def run(*arrays, width=WIDTH, height=HEIGHT):
-        loss = lambda *a: (weigh(values := draw(*a, width=width, height=height)), values)
+        loss = lambda *a: (weighted_loss(values := draw(*a, width=width, height=height)), values)
         (_, values), gradients = jax.value_and_grad(loss, tuple(range(7)), has_aux=True)(*arrays)
         return values, gradients
 
@@ -99,7 +99,7 @@ def golden_loss(arrays, weights, width, height):
         pytest.param("s500o_96x64", jnp.float64, "reference", marks=pytest.mark.slow),
     ],
 )
-def test_golden_scenes(name, dtype, form):
+def test_images_and_gradients_match_the_golden_scenes(name, dtype, form):
     golden = np.load(GOLDEN / f"{name}.npz")
     arrays = [jnp.asarray(golden[f"in_{key}"], dtype) for key in NAMES]
     weights = [jnp.asarray(golden[f"in_w_{key}"], dtype) for key in ("features", "alpha", "depth")]
@@ -124,10 +124,10 @@ def test_agrees_with_the_dense_oracle(seed):
     expected, expected_gradients = dense(*arrays)
     assert_close(values, expected)
     assert_close(gradients, expected_gradients)
-    assert values[1].max() > 0.999  # the rule that ends a pixel was exercised
+    assert values[1].max() > 0.999  # some pixels end early
 
 
-def test_an_image_of_one_pixel():
+def test_an_image_of_one_pixel_is_rendered():
     arrays = scene(4, width=1, height=1)
     values, gradients = fast(*arrays, width=1, height=1)
     assert values[1].shape == (1, 1)
@@ -148,7 +148,7 @@ def test_every_form_agrees(form):
 
 # One tile, as many tiles as a block for CPUs, one more than that, and a few blocks with a remainder.
 @pytest.mark.parametrize(("width", "height"), [(8, 8), (32, 16), (72, 8), (33, 39)])
-def test_tiles_that_fill_blocks_or_do_not(width, height):
+def test_full_and_partial_blocks_of_tiles_agree_with_the_oracle(width, height):
     arrays = scene(10, width=width, height=height)
     values, gradients = fast(*arrays, width=width, height=height)
     expected, expected_gradients = dense(*arrays, width=width, height=height)
@@ -156,7 +156,7 @@ def test_tiles_that_fill_blocks_or_do_not(width, height):
     assert_close(gradients, expected_gradients)
 
 
-def test_numerical_gradients():
+def test_gradients_match_finite_differences():
     # Wide, faint, few: no contribution is near a threshold, where the image jumps.
     means, quats, scales, _, features, viewmat, K = (x[:3] if i < 5 else x for i, x in enumerate(scene(7)))
     arrays = means * jnp.array([0.1, 0.1, 1.0])[None], quats, 4 + scales, jnp.array([0.3, 0.5, 0.4]), features
@@ -169,10 +169,10 @@ def test_numerical_gradients():
 @pytest.mark.parametrize("batch", [fast, jax.jit(jax.vmap(fast))], ids=["views", "vmap"])
 def test_a_batch_equals_a_loop(batch, form):
     arrays = stacked(range(3))
-    apart = [fast(*(x[v] for x in arrays)) for v in range(3)]
+    alone = [fast(*(x[v] for x in arrays)) for v in range(3)]
     with use_kernels(form):
         together = batch(*arrays)
-    for actual, expected in zip(together, jax.tree.map(lambda *x: jnp.stack(x), *apart), strict=True):
+    for actual, expected in zip(together, jax.tree.map(lambda *x: jnp.stack(x), *alone), strict=True):
         assert_close(actual, expected, 1e-12)
 
 
@@ -181,14 +181,14 @@ def test_views_may_share_their_gaussians():
     viewmats = jnp.stack([viewmat, viewmat.at[0, 3].add(0.3)])
     Ks = jnp.stack([K, K.at[0, 0].add(4)])
     values, gradients = fast(*gaussians, viewmats, Ks)
-    apart = [fast(*gaussians, v, k) for v, k in zip(viewmats, Ks, strict=True)]
-    assert_close(values, jax.tree.map(lambda *x: jnp.stack(x), *(values for values, _ in apart)), 1e-12)
-    assert_close(gradients[:5], [a + b for a, b in zip(*(gradients[:5] for _, gradients in apart), strict=True)], 1e-11)
+    alone = [fast(*gaussians, v, k) for v, k in zip(viewmats, Ks, strict=True)]
+    assert_close(values, jax.tree.map(lambda *x: jnp.stack(x), *(values for values, _ in alone)), 1e-12)
+    assert_close(gradients[:5], [a + b for a, b in zip(*(gradients[:5] for _, gradients in alone), strict=True)], 1e-11)
     with pytest.raises(ValueError, match="expected as many, or shared ones"):
         rasterize(*(jnp.stack([x] * 3) for x in gaussians), viewmats, Ks, WIDTH, HEIGHT)
 
 
-def test_depth_is_accumulated_or_expected():
+def test_expected_depth_is_accumulated_depth_over_alpha():
     golden = np.load(GOLDEN / "s500_96x64.npz")
     arrays = [jnp.asarray(golden[f"in_{key}"]) for key in NAMES]
     drawn = rasterize(*arrays, int(golden["in_width"]), int(golden["in_height"]), depth_mode="expected")
@@ -214,7 +214,7 @@ def test_the_near_plane_hides_and_the_blur_widens():
 
 
 @pytest.mark.parametrize("form", [None, ACCELERATOR])
-def test_nothing_at_all_is_black(form):
+def test_no_gaussians_give_a_black_image(form):
     means, quats, scales, opacities, features, viewmat, K = scene(1)
     empty = [x[:0] for x in (means, quats, scales, opacities, features)]
     with use_kernels(form):
@@ -223,13 +223,13 @@ def test_nothing_at_all_is_black(form):
     assert values[0].shape == (HEIGHT, WIDTH, 2)
 
 
-def test_members_may_share_what_they_draw():
+def test_vmap_over_features_or_cotangents_alone_equals_a_loop():
     *geometry, features, viewmat, K = scene(12)
     draw = lambda features: rasterize(*geometry, features, viewmat, K, WIDTH, HEIGHT, pair_capacity=CAPACITY).features
     image, pullback = jax.vjp(draw, features)
     many = jnp.stack([features, 2 * features, features + 1])
     cotangents = jnp.stack([image, image**2, image - 0.5])
-    # The lists are the same for all, the colours are not; then only the cotangents differ; then there are two axes.
+    # First only the features differ, then only the cotangents; then two axes are vmapped.
     assert_close([jax.jit(jax.vmap(draw))(many)], [jnp.stack([draw(x) for x in many])], 1e-12)
     (together,) = jax.vmap(pullback)(cotangents)
     assert_close([together], [jnp.stack([pullback(x)[0] for x in cotangents])], 1e-12)
@@ -238,7 +238,7 @@ def test_members_may_share_what_they_draw():
 
 
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
-def test_extremes_are_finite(dtype):
+def test_extreme_inputs_give_finite_values_and_gradients(dtype):
     means, quats, scales, opacities, features, viewmat, K = (x.astype(dtype) for x in scene(5))
     opacities = opacities.at[:10].set(0).at[10:30].set(1)
     quats = quats.at[::4].set(0)
@@ -270,18 +270,18 @@ def test_nan_is_not_hidden(form):
             assert np.isnan(fast(*broken)[0][0]).any(), NAMES[position]
 
 
-def test_radii_bound_what_is_drawn():
+def test_radii_tightly_bound_what_is_drawn():
     count = 60
     means, quats, scales, opacities, _, viewmat, K = scene(11, count)
-    alone = jnp.eye(count)  # a channel per Gaussian shows where it contributes
+    one_hot = jnp.eye(count)  # a channel per Gaussian shows where it contributes
     scales, opacities = 0.2 * scales, opacities.at[::5].set(0.003)
-    output = rasterize(means, quats, scales, opacities, alone, viewmat, K, WIDTH, HEIGHT)
-    rows, columns, which = np.nonzero(np.asarray(output.features))
+    output = rasterize(means, quats, scales, opacities, one_hot, viewmat, K, WIDTH, HEIGHT)
+    rows, columns, gaussian = np.nonzero(np.asarray(output.features))
     centres, radii = np.asarray(output.means2d), np.asarray(output.radii)
-    reach = np.maximum(abs(columns + 0.5 - centres[which, 0]), abs(rows + 0.5 - centres[which, 1]))
-    assert np.all(reach <= radii[which])
+    reach = np.maximum(abs(columns + 0.5 - centres[gaussian, 0]), abs(rows + 0.5 - centres[gaussian, 1]))
+    assert np.all(reach <= radii[gaussian])
     assert np.all(radii[::5] == 0)
-    assert np.max(reach / radii[which]) > 0.9  # and tightly
+    assert np.max(reach / radii[gaussian]) > 0.9
 
 
 def test_probe_moves_the_centres():
@@ -300,9 +300,9 @@ def test_overflow_is_reported(form):
 
 
 def check_overflow(arrays):
-    short = rasterize(*arrays, WIDTH, HEIGHT, pair_capacity=50)
-    needed = int(short.pairs)
-    assert short.overflow
+    small = rasterize(*arrays, WIDTH, HEIGHT, pair_capacity=50)
+    needed = int(small.pairs)
+    assert small.overflow
     assert needed > 50
     enough = rasterize(*arrays, WIDTH, HEIGHT, pair_capacity=needed)
     assert not enough.overflow
@@ -313,7 +313,7 @@ def check_overflow(arrays):
 
 
 @pytest.mark.parametrize("transformed", [jax.jit, lambda draw: jax.vmap(draw, axis_size=2)])
-def test_hidden_values_need_a_capacity(transformed):
+def test_under_jit_or_vmap_a_pair_capacity_is_required(transformed):
     arrays = stacked((0, 1))
     with pytest.raises(ValueError, match="pair_capacity under jit or vmap"):
         transformed(lambda *a: rasterize(*a, WIDTH, HEIGHT))(*arrays)

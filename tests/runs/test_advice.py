@@ -1,4 +1,4 @@
-"""What `train` warns of."""
+"""Warnings of `train` about scenes that do not suit their settings."""
 
 import dataclasses
 
@@ -18,7 +18,7 @@ def dataset_of(frames=FEW_FRAMES, points=FEW_POINTS, size=(400, 225)):
     return dataclasses.replace(dataset, train=train, points=np.zeros((points, 3)), width=size[0], height=size[1])
 
 
-def test_a_scene_that_suits_its_settings_needs_no_words():
+def test_a_scene_that_suits_its_settings_gives_no_warning():
     assert misfit(dataset_of(), tiny(density=FIXED)) is None
 
 
@@ -30,15 +30,15 @@ def test_a_scene_that_suits_its_settings_needs_no_words():
         (dataset_of(points=20), FIXED, ["20 points", "--density.stop"]),
     ],
 )
-def test_what_does_not_fit_is_said_in_one_line(dataset, density, words):
+def test_a_misfit_gives_a_warning_of_one_line(dataset, density, words):
     warning = misfit(dataset, tiny(density=density))
     assert all(word in warning for word in words)
     assert "\n" not in warning
 
 
-def test_points_that_are_added_need_not_be_there_at_first():
+def test_few_points_give_no_warning_if_gaussians_are_added():
     assert misfit(dataset_of(points=20), tiny(density=GROWING)) is None
 
 
-def test_a_larger_factor_starts_from_the_one_in_use():
+def test_the_suggested_downscale_multiplies_the_one_in_use():
     assert "--downscale 4" in misfit(dataset_of(size=(960, 540)), tiny(density=FIXED, downscale=2))

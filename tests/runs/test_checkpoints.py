@@ -1,4 +1,4 @@
-"""Checkpoints: whole or refused, by one sentence."""
+"""Checkpoints are read completely, or refused in one sentence."""
 
 import dataclasses
 import json
@@ -28,7 +28,7 @@ def dataset():
 
 
 @pytest.mark.parametrize("damage", ["truncated", "text", "missing", "settings"])
-def test_a_bad_checkpoint_is_one_clear_sentence(dataset, tmp_path, damage):
+def test_an_unusable_checkpoint_is_refused_in_one_sentence(dataset, tmp_path, damage):
     config = tiny()
     path = tmp_path / "checkpoint.npz"
     checkpoints.save(path, Checkpoint(initial_state(dataset, config), 64), config)
@@ -82,7 +82,7 @@ def test_no_array_is_read_before_all_are_known_to_fit(dataset, tmp_path, monkeyp
     assert read == ["header.npy"]
 
 
-def test_how_a_run_is_carried_out_may_change_when_it_goes_on(dataset, tmp_path):
+def test_execution_settings_may_change_on_resuming(dataset, tmp_path):
     config, path = tiny(), tmp_path / "checkpoint.npz"
     state = initial_state(dataset, config)
     checkpoints.save(path, Checkpoint(state, 64), config)
@@ -91,8 +91,8 @@ def test_how_a_run_is_carried_out_may_change_when_it_goes_on(dataset, tmp_path):
     assert_equal_states(checkpoints.load(path, other, FRAMES).state, state)
 
 
-def edited(path, **header):
-    """Write a checkpoint's file anew with some entries of its header changed, or without those that are None."""
+def rewrite_header(path, **header):
+    """Rewrite a checkpoint with entries of its header changed; None removes one."""
     with np.load(path) as file:
         arrays = dict(file)
     facts = json.loads(str(arrays["header"])) | header
@@ -105,18 +105,18 @@ def test_older_versions_are_read_and_later_ones_refused(dataset, tmp_path):
     state = initial_state(dataset, config)
     checkpoints.save(path, Checkpoint(state, 64, halvings=2), config)
     assert checkpoints.load(path, config, FRAMES)[1:] == (64, 2)
-    edited(path, version=None, halvings=None)  # as 0.1.0 wrote it
+    rewrite_header(path, version=None, halvings=None)  # as 0.1.0 wrote it
     old = checkpoints.load(path, config, FRAMES)
     assert old[1:] == (64, 0)
     assert_equal_states(old.state, state)
-    edited(path, version=checkpoints.VERSION + 1, config={"nonsuch": 1})
+    rewrite_header(path, version=checkpoints.VERSION + 1, config={"nonsuch": 1})
     with pytest.raises(UserError, match=r"npz: of version 3; expected at most 2") as caught:
         checkpoints.load(path, config, FRAMES)
     assert not isinstance(caught.value, checkpoints.DamagedError)
 
 
 class Bomb:
-    """Goes off when it is unpickled."""
+    """Creates a folder when it is unpickled."""
 
     def __reduce__(self):
         return os.mkdir, ("exploded",)
@@ -137,7 +137,7 @@ def test_nothing_in_a_checkpoint_is_executed(dataset, tmp_path, monkeypatch, pla
     assert not (tmp_path / "exploded").exists()
 
 
-def numbered(dataset, step):
+def checkpoint_at(dataset, step):
     return Checkpoint(initial_state(dataset, tiny())._replace(step=jnp.int32(step)))
 
 
@@ -145,24 +145,24 @@ def steps_kept(path):
     return [int(checkpoints.load(file, tiny(), FRAMES).state.step) for file in checkpoints.kept(path)]
 
 
-def test_the_last_few_are_kept(dataset, tmp_path):
+def test_the_last_few_checkpoints_are_kept(dataset, tmp_path):
     path = tmp_path / "checkpoint.npz"
     (tmp_path / "coarse.npz").touch()
     assert checkpoints.kept(path) == []
     for step, keep, expected in ((1, 3, [1]), (2, 3, [2, 1]), (3, 3, [3, 2, 1]), (4, 3, [4, 3, 2]), (5, 1, [5])):
-        checkpoints.save(path, numbered(dataset, step), tiny(), keep)
+        checkpoints.save(path, checkpoint_at(dataset, step), tiny(), keep)
         assert steps_kept(path) == expected
     assert sorted(file.name for file in tmp_path.iterdir()) == ["checkpoint.npz", "coarse.npz"]
 
 
-def test_a_truncated_one_is_passed_over_and_pushes_out_none(dataset, tmp_path):
+def test_a_truncated_checkpoint_is_skipped_and_displaces_no_intact_one(dataset, tmp_path):
     path = tmp_path / "checkpoint.npz"
     for step in (1, 2):
-        checkpoints.save(path, numbered(dataset, step), tiny(), 2)
+        checkpoints.save(path, checkpoint_at(dataset, step), tiny(), 2)
     path.write_bytes(path.read_bytes()[:-30])
     with pytest.warns(UserWarning, match=r"npz: truncated .*; checkpoint-1\.npz, of step 1, is used instead"):
         assert checkpoints.load_last(path, tiny(), FRAMES).state.step == 1
-    checkpoints.save(path, numbered(dataset, 3), tiny(), 2)
+    checkpoints.save(path, checkpoint_at(dataset, 3), tiny(), 2)
     assert steps_kept(path) == [3, 1]
     assert checkpoints.load_last(path, tiny(), FRAMES, skip=1).state.step == 1
     assert checkpoints.load_last(path, tiny(), FRAMES, skip=9).state.step == 1
@@ -172,13 +172,13 @@ def test_a_truncated_one_is_passed_over_and_pushes_out_none(dataset, tmp_path):
         checkpoints.load_last(path, tiny(), FRAMES)
 
 
-def test_a_byte_that_has_changed_is_found_or_does_not_matter(dataset, tmp_path):
+def test_a_changed_byte_is_detected_or_does_not_matter(dataset, tmp_path):
     path = tmp_path / "checkpoint.npz"
     state = initial_state(dataset, tiny())
     checkpoints.save(path, Checkpoint(state, 64), tiny())
-    whole, rng, refused = path.read_bytes(), np.random.default_rng(0), 0
-    for place in rng.integers(0, len(whole), 25):
-        path.write_bytes(whole[:place] + bytes([whole[place] ^ 255]) + whole[place + 1 :])
+    content, rng, refused = path.read_bytes(), np.random.default_rng(0), 0
+    for offset in rng.integers(0, len(content), 25):
+        path.write_bytes(content[:offset] + bytes([content[offset] ^ 255]) + content[offset + 1 :])
         try:
             assert_equal_states(checkpoints.load(path, tiny(), FRAMES).state, state)
         except UserError:
@@ -187,15 +187,15 @@ def test_a_byte_that_has_changed_is_found_or_does_not_matter(dataset, tmp_path):
 
 
 @pytest.mark.skipif(resource is None, reason="the system has no limits")
-def test_a_full_disk_leaves_the_one_before(dataset, tmp_path):
+def test_a_full_disk_leaves_the_previous_checkpoint(dataset, tmp_path):
     path = tmp_path / "checkpoint.npz"
-    checkpoints.save(path, numbered(dataset, 1), tiny(), 2)
+    checkpoints.save(path, checkpoint_at(dataset, 1), tiny(), 2)
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     for room in (0, path.stat().st_size // 2, path.stat().st_size - 1):
         resource.setrlimit(resource.RLIMIT_FSIZE, (room, before[1]))
         try:
             with pytest.raises(UserError, match=r"npz: cannot be written \(File too large\); expected") as caught:
-                checkpoints.save(path, numbered(dataset, 2), tiny(), 2)
+                checkpoints.save(path, checkpoint_at(dataset, 2), tiny(), 2)
         finally:
             resource.setrlimit(resource.RLIMIT_FSIZE, before)
         assert caught.value.code == DISK_FULL

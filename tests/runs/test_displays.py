@@ -1,4 +1,4 @@
-"""How a training shows itself."""
+"""Displays of the progress of a training."""
 
 import io
 import json
@@ -12,7 +12,7 @@ LINE = {"step": 10, "stage": "coarse", "gaussians": 7, "loss": 0.5, "psnr": 30.0
 
 
 def show(display, steps=40):
-    """A training of which every step takes a second."""
+    """Send the events of a training whose steps take a second each."""
     display("begin", step=0, steps=steps)
     display("compiling", stage="coarse")
     for step in range(1, steps + 1):
@@ -24,7 +24,7 @@ def show(display, steps=40):
 
 
 class Clocked:
-    """A display with a clock of its own."""
+    """A display with a clock that the test sets."""
 
     def __init__(self, display, monkeypatch):
         self.display, self.now = display, 1000.0
@@ -37,7 +37,7 @@ class Clocked:
         self.now += seconds
 
 
-def test_a_log_has_a_line_now_and_then_and_the_time_left(monkeypatch, capsys):
+def test_a_log_has_occasional_lines_with_the_time_left(monkeypatch, capsys):
     with displays.choose() as display:
         show(Clocked(display, monkeypatch))
     output, errors = capsys.readouterr()
@@ -50,7 +50,7 @@ def test_a_log_has_a_line_now_and_then_and_the_time_left(monkeypatch, capsys):
     ]
 
 
-def test_json_alone_goes_to_standard_output(monkeypatch, capsys):
+def test_only_json_goes_to_standard_output(monkeypatch, capsys):
     with displays.choose(as_json=True) as display:
         print("for people")
         show(Clocked(display, monkeypatch), steps=10)
@@ -76,7 +76,7 @@ class Terminal(io.StringIO):
         return True
 
 
-def test_a_terminal_has_a_bar(monkeypatch):
+def test_a_terminal_shows_a_progress_bar(monkeypatch):
     terminal = Terminal()
     monkeypatch.setattr(sys, "stderr", terminal)
     with displays.choose() as display:
@@ -97,7 +97,7 @@ def test_a_terminal_has_a_bar(monkeypatch):
 
 
 @pytest.mark.parametrize("options", [{}, {"quiet": True}, {"as_json": True}])
-def test_messages_before_the_first_step(options, capsys):
+def test_messages_before_the_first_step_are_shown_unless_quiet(options, capsys):
     with displays.choose(**options) as display:
         display("stopping", message="soon")
     assert ("soon" in "".join(capsys.readouterr())) == ("quiet" not in options)

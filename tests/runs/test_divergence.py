@@ -7,8 +7,8 @@ import pytest
 
 from l2dgs_jax.runs.divergence import EXPLODED_LINES, EXPLOSION_FACTOR, USUAL_LINES, explosion
 
-# Of the trainings that went well, those that come nearest to an explosion: every tenth step, start of the fine stage,
-# births and clones included.
+# Losses of healthy trainings that come nearest to an explosion: every tenth step, with the start of the fine stage,
+# births and clones.
 CURVES = json.loads((Path(__file__).parent / "healthy_losses.json").read_text())
 
 
@@ -17,7 +17,7 @@ def first_alarm(losses):
 
 
 @pytest.mark.parametrize("name", CURVES)
-def test_no_alarm_in_a_training_that_goes_well(name):
+def test_healthy_trainings_raise_no_alarm(name):
     assert first_alarm(CURVES[name]) is None
 
 
@@ -36,5 +36,5 @@ def test_a_few_bad_views_are_no_explosion():
     assert first_alarm([1.0] * 50 + [1000.0] * (EXPLODED_LINES - 1) + [1.0] * 50) is None
 
 
-def test_a_factor_is_told():
+def test_the_growth_factor_is_returned():
     assert explosion([1.0] * 20 + [5.0, 6.0, 7.0]) == 5

@@ -26,13 +26,13 @@ def dataset():
 def quick(monkeypatch):
     """Steps that only count."""
 
-    def take(states, batches, values, number, **_):
+    def train_steps(states, batches, values, number, **_):
         return states._replace(step=states.step + 1), StepReport(*[jnp.zeros(1)] * 6), engine.Tally(0, 1)
 
-    monkeypatch.setattr(engine, "train_steps", take)
+    monkeypatch.setattr(engine, "train_steps", train_steps)
 
 
-def test_every_step_is_told_and_the_last_state_is_the_runs(dataset, quick):
+def test_every_step_is_reported_and_the_run_has_the_last_state(dataset, quick):
     seen = []
     config = tiny(coarse_steps=2, fine_steps=3, density=PRESETS["default"].density)
     run = fit(dataset, config, lambda progress: seen.append(int(devices.member(progress.states, 0).step)))
@@ -64,17 +64,17 @@ def test_black_frames_are_refused(dataset):
     ("views", "side", "found"),
     [(3, 50, 1_500), (32, 50, 2_000), (80, 50, 2_500), (3, 1_000, 360_000)],
 )
-def test_how_many_gaussians_there_may_be_follows_pixels_and_views_up_to_a_bound(dataset, views, side, found):
+def test_automatic_max_gaussians_follows_pixels_and_views_up_to_a_bound(dataset, views, side, found):
     frames = np.full((views, side, side, 3), 0.1, np.float16)
     large = dataclasses.replace(dataset, train=dataclasses.replace(dataset.train, images=frames))
     config = overrides.replace(tiny(), {"density.max_gaussians": "auto"})
     assert resolve(config, large).density.max_gaussians == found
 
 
-def test_what_is_left_to_the_data_is_filled_in(dataset, quick):
-    left = {"model.initial_exponents": ("auto", 9.0), "model.initial_illumination": "auto"}
-    left |= {"loss.exposure_level": "auto", "model.domain": "auto", "model.tone": "auto"}
-    run = fit(dataset, overrides.replace(tiny(coarse_steps=1, fine_steps=0), left))
+def test_automatic_settings_are_derived_from_the_data(dataset, quick):
+    automatic = {"model.initial_exponents": ("auto", 9.0), "model.initial_illumination": "auto"}
+    automatic |= {"loss.exposure_level": "auto", "model.domain": "auto", "model.tone": "auto"}
+    run = fit(dataset, overrides.replace(tiny(coarse_steps=1, fine_steps=0), automatic))
     exponent, _ = run.config.model.initial_exponents
     assert 1 < exponent <= 2
     assert 0 < run.config.model.initial_illumination < 1
@@ -83,7 +83,7 @@ def test_what_is_left_to_the_data_is_filled_in(dataset, quick):
     assert not run.moving
 
 
-def test_views_that_cannot_be_shared(dataset):
+def test_impossible_counts_of_devices_or_steps_are_refused(dataset):
     with pytest.raises(ValueError, match="devices are wanted"):
         fit(dataset, tiny(batch_size=64), device_count=64)
     for count in (0, 3):
@@ -93,7 +93,7 @@ def test_views_that_cannot_be_shared(dataset):
         fit(dataset, tiny(coarse_steps=0, fine_steps=0))
 
 
-def test_views_of_any_size_and_instant(dataset, quick):
+def test_a_run_renders_views_of_any_size(dataset, quick):
     run = fit(dataset, tiny(coarse_steps=1, fine_steps=1, density=PRESETS["default"].density))
     camera = dataset.test.camera(2)
     view = run.render(camera)
@@ -106,7 +106,7 @@ def test_views_of_any_size_and_instant(dataset, quick):
     assert run.renderer() is run.renderer(dataset.width, dataset.height)
 
 
-def test_a_saved_run_opens_and_goes_on(tmp_path, quick):
+def test_a_saved_run_is_opened_unchanged(tmp_path, quick):
     scene = write_nerfies(tmp_path / "scene", 8, 24, 18, num_points=12)
     dataset = load_dataset(scene, downscale=2, held_out="3")
     config = tiny(coarse_steps=2, fine_steps=2, density=PRESETS["default"].density)
@@ -114,21 +114,21 @@ def test_a_saved_run_opens_and_goes_on(tmp_path, quick):
     assert (run.config.downscale, run.config.held_out) == (2, "3")
     saved = save_run(run, tmp_path / "run")
     assert saved.folder == tmp_path / "run"
-    again = open_run(tmp_path / "run")
-    assert again.config == run.config
-    assert_equal_states(again.state, run.state)
-    assert again.dataset.test.names == dataset.test.names
+    reopened = open_run(tmp_path / "run")
+    assert reopened.config == run.config
+    assert_equal_states(reopened.state, run.state)
+    assert reopened.dataset.test.names == dataset.test.names
     with pytest.raises(UserError, match="already holds"):
         save_run(run, tmp_path / "run")
 
 
-def test_a_run_of_no_scene_cannot_be_saved(dataset, tmp_path, quick):
+def test_a_run_that_was_not_read_from_a_scene_cannot_be_saved(dataset, tmp_path, quick):
     run = fit(dataset, tiny(coarse_steps=1, fine_steps=0, density=PRESETS["default"].density))
     with pytest.raises(UserError, match="tiny: was not read from a scene"):
         save_run(run, tmp_path / "run")
 
 
-def test_halved_rates_hold_for_both_stages(dataset, quick):
+def test_halved_rates_hold_in_the_fine_stage(dataset, quick):
     config = resolve(tiny(coarse_steps=2, fine_steps=2, density=PRESETS["default"].density), dataset)
     rates = []
     start = Checkpoint(initial_state(dataset, config)._replace(step=jnp.int32(2)), 2048, halvings=2)

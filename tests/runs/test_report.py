@@ -1,4 +1,4 @@
-"""The page that shows how a training goes, and the events for TensorBoard."""
+"""The report page of a training, and its events for TensorBoard."""
 
 import json
 import re
@@ -33,13 +33,13 @@ def line(step):
     return {**facts, **values, "rates": rates}
 
 
-def shown(folder):
+def page_data(folder):
     page = (folder / REPORT).read_text()
     return json.loads(re.search(r'id="data">(.*?)</script>', page, re.S)[1])
 
 
-def train(display, folder, first, last):
-    """What a display is told of a training from after the step `first` on."""
+def send_events(display, folder, first, last):
+    """Send a display the events of a training after step `first`, up to step `last`."""
     display("start", scene="<toys> DATA", run=str(folder), step=first, steps=STEPS)
     display("begin", step=first, steps=STEPS)
     display("compiling", stage="coarse")
@@ -51,20 +51,20 @@ def train(display, folder, first, last):
             display("metrics", **line(step))
 
 
-def draw(folder, step):
+def write_previews(folder, step):
     for view in previews.VIEWS:
         for kind, level in (("lowlight", 0.1), ("welllit", 0.7)):
             previews._write(previews._path(folder, view, kind, step), to_bytes(np.full((24, 32, 3), level)))
         previews._write(previews._path(folder, view, previews.INPUT), to_bytes(np.full((24, 32, 3), 0.1)))
 
 
-def test_the_page_has_the_whole_history_also_after_an_interruption(tmp_path):
-    train(Report(tmp_path), tmp_path, 0, 400)
+def test_the_page_keeps_the_whole_history_after_an_interruption(tmp_path):
+    send_events(Report(tmp_path), tmp_path, 0, 400)
     display = Report(tmp_path)
-    train(display, tmp_path, 400, 700)
-    draw(tmp_path, 300)
+    send_events(display, tmp_path, 400, 700)
+    write_previews(tmp_path, 300)
     display("previews", step=300, files=[])
-    data = shown(tmp_path)
+    data = page_data(tmp_path)
     assert data["curves"]["step"] == list(range(10, 701, 10))
     assert data["curves"]["terms"]["l1"] == pytest.approx([1 / step for step in range(10, 701, 10)])
     assert data["curves"]["rates"].keys() == {"means", "lifetimes"}
@@ -74,12 +74,12 @@ def test_the_page_has_the_whole_history_also_after_an_interruption(tmp_path):
     assert data["left"] == pytest.approx(100)
 
 
-def test_the_page_tells_the_end_and_needs_no_other_file_or_server(tmp_path):
+def test_the_page_shows_the_end_and_needs_no_other_file_or_server(tmp_path):
     display = Report(tmp_path)
-    train(display, tmp_path, 0, 200)
+    send_events(display, tmp_path, 0, 200)
     display("diverged", message="going back", step=100, rate_factor=0.5)
     display("end", code=143, reason="stopped after step 200 of 1200; go on with: </script>")
-    data, page = shown(tmp_path), (tmp_path / REPORT).read_text()
+    data, page = page_data(tmp_path), (tmp_path / REPORT).read_text()
     assert not data["running"]
     assert data["state"].endswith("</script>")
     assert data["note"] == "going back"
@@ -87,7 +87,7 @@ def test_the_page_tells_the_end_and_needs_no_other_file_or_server(tmp_path):
     assert not re.search(r"https?://(?!www\.w3\.org)|<link|<script src|@import|fetch\(", page)
 
 
-def test_steps_write_the_page_now_and_then_only(tmp_path, monkeypatch):
+def test_the_page_is_written_at_intervals_only(tmp_path, monkeypatch):
     now, written = 1000.0, []
     monkeypatch.setattr(report.time, "monotonic", lambda: now)
     monkeypatch.setattr(Report, "write", lambda self: written.append(now))
@@ -99,14 +99,14 @@ def test_steps_write_the_page_now_and_then_only(tmp_path, monkeypatch):
     assert len(written) == 1 + 100 // report.WRITE_INTERVAL
 
 
-def test_a_page_that_cannot_be_written_ends_no_training(tmp_path):
+def test_a_page_that_cannot_be_written_does_not_end_the_training(tmp_path):
     (tmp_path / REPORT).mkdir()
-    train(Report(tmp_path), tmp_path, 0, 20)
+    send_events(Report(tmp_path), tmp_path, 0, 20)
     with pytest.raises(UserError, match=r"report\.html"):
         Report(tmp_path).write()
 
 
-def test_a_long_run_is_thinned_and_what_is_not_finite_is_a_gap():
+def test_curves_of_a_long_run_are_thinned_and_values_not_finite_are_gaps():
     lines = [line(step) for step in range(10, 23_001, 10)]
     lines[-1]["psnr"] = float("inf")
     del lines[-6]["rates"]
@@ -119,10 +119,10 @@ def test_a_long_run_is_thinned_and_what_is_not_finite_is_a_gap():
 
 
 def test_pictures_of_lost_steps_are_dropped(tmp_path):
-    draw(tmp_path, 300)
-    draw(tmp_path, 600)
-    torn = tmp_path / previews.PREVIEWS / "training" / "welllit-000900.tmp.jpg"
-    torn.write_bytes(b"")
+    write_previews(tmp_path, 300)
+    write_previews(tmp_path, 600)
+    unfinished = tmp_path / previews.PREVIEWS / "training" / "welllit-000900.tmp.jpg"
+    unfinished.write_bytes(b"")
     previews.drop_after(tmp_path, 300)
     assert {(found.kind, found.step) for found in previews.kept(tmp_path)} == {
         ("input", None),
@@ -131,13 +131,13 @@ def test_pictures_of_lost_steps_are_dropped(tmp_path):
     }
 
 
-def test_tensorboard_has_scalars_and_pictures_and_forgets_lost_steps(tmp_path):
+def test_tensorboard_has_scalars_and_pictures_and_purges_lost_steps(tmp_path):
     display = TensorBoard(tmp_path)
-    train(display, tmp_path, 0, 50)
-    draw(tmp_path, 40)
+    send_events(display, tmp_path, 0, 50)
+    write_previews(tmp_path, 40)
     display("previews", step=40, files=[])
     display("diverged", message="going back", step=30)
-    train(display, tmp_path, 30, 60)
+    send_events(display, tmp_path, 30, 60)
     display("end", code=0)
     tags, purged = {}, []
     for path in sorted((tmp_path / EVENTS_FOLDER).iterdir()):
@@ -153,7 +153,7 @@ def test_tensorboard_has_scalars_and_pictures_and_forgets_lost_steps(tmp_path):
 
 
 def events(path):
-    """Of a file of records: a length of 8 bytes, 4 of its checksum, the record, and 4 of that one's."""
+    """Events of a file of records: 8 bytes of length, 4 of its checksum, the record, 4 of its checksum."""
     from tensorboardX.proto.event_pb2 import Event
 
     content = path.read_bytes()
@@ -173,9 +173,9 @@ def test_without_the_extra_tensorboard_is_refused_in_one_sentence(tmp_path, monk
 @pytest.mark.skipif(not shutil.which("chromium"), reason="Chromium is not installed")
 def test_a_browser_draws_the_page(tmp_path):
     display = Report(tmp_path)
-    train(display, tmp_path, 0, 600)
-    draw(tmp_path, 300)
-    draw(tmp_path, 600)
+    send_events(display, tmp_path, 0, 600)
+    write_previews(tmp_path, 300)
+    write_previews(tmp_path, 600)
     display("end", code=0)
     drawn = result_of(tmp_path / REPORT, "return document.documentElement.outerHTML", tmp_path)
     assert "&lt;toys&gt; DATA" in drawn

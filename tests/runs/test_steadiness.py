@@ -1,4 +1,4 @@
-"""How steady videos are whose motion is known."""
+"""Steadiness of videos with known motion."""
 
 import dataclasses
 
@@ -15,7 +15,7 @@ FRAMES, HEIGHT, WIDTH = 4, 64, 96
 
 @pytest.fixture(scope="module")
 def split():
-    """A textured plane that moves a pixel to the right from frame to frame, seen by a camera that stands."""
+    """A textured plane that moves a pixel to the right from frame to frame, seen by a static camera."""
     rng = np.random.default_rng(0)
     plane = cv2.GaussianBlur(rng.uniform(0, 1, (HEIGHT, WIDTH + FRAMES, 3)), (0, 0), 2)
     plane = 0.2 + 0.5 * (plane - plane.min()) / np.ptp(plane)
@@ -27,7 +27,7 @@ def split():
     return Split(tuple("abcd"), cameras, truth / 10, truth, masks)
 
 
-def test_what_moves_as_the_truth_is_as_steady(split):
+def test_a_video_equal_to_the_truth_is_as_steady_as_it(split):
     found = steadiness(split.welllit, split, 1.0)
     assert (found["flow"], found["pairs"]) == ("truth", FRAMES - 1)
     for region in ("overall", "dynamic", "static"):
@@ -38,7 +38,7 @@ def test_what_moves_as_the_truth_is_as_steady(split):
     assert areas["overall"] == pytest.approx(areas["dynamic"] + areas["static"])
 
 
-def test_flicker_is_unsteady_where_it_is(split):
+def test_flicker_raises_the_warping_error_of_its_region_only(split):
     flicker = split.welllit.copy()
     flicker[1::2, :, WIDTH // 2 :] += 0.1
     regions = steadiness(flicker / 2, split, 2.0)["regions"]
@@ -48,19 +48,19 @@ def test_flicker_is_unsteady_where_it_is(split):
     assert regions["static"]["warping_error_truth"] < 1e-4
 
 
-def test_without_truth_flow_is_found_in_the_input(split):
+def test_without_truth_flow_is_computed_from_the_input(split):
     found = steadiness(split.welllit, dataclasses.replace(split, welllit=None), None)
     assert found["flow"] == "input"
     assert found["regions"]["overall"].keys() == {"warping_error", "area"}
     assert found["regions"]["overall"]["warping_error"] < 1e-4
 
 
-def test_one_view_has_none_to_be_compared_with(split):
-    alone = Split(("a",), Camera(*(x[:1] for x in split.cameras)), split.images[:1], split.welllit[:1])
-    assert steadiness(alone.welllit, alone, 1.0) == {"flow": "truth", "pairs": 0, "regions": {}}
+def test_a_single_view_has_no_pairs(split):
+    single = Split(("a",), Camera(*(x[:1] for x in split.cameras)), split.images[:1], split.welllit[:1])
+    assert steadiness(single.welllit, single, 1.0) == {"flow": "truth", "pairs": 0, "regions": {}}
 
 
-def test_pixels_that_do_not_count_are_left_out(split):
+def test_invalid_pixels_are_left_out(split):
     valid = np.ones((FRAMES, HEIGHT, WIDTH), bool)
     valid[:, :, WIDTH // 2 :] = False
     flicker = split.welllit.copy()

@@ -1,4 +1,4 @@
-"""Views one after the other, and what is shown meanwhile."""
+"""Rendering views one after the other, with a progress bar."""
 
 import io
 import sys
@@ -17,7 +17,7 @@ class Terminal(io.StringIO):
 
 
 @pytest.mark.parametrize("quiet", [False, True])
-def test_a_terminal_sees_a_bar_unless_it_is_to_be_quiet(monkeypatch, quiet):
+def test_a_terminal_shows_a_progress_bar_unless_quiet(monkeypatch, quiet):
     terminal = Terminal()
     monkeypatch.setattr(sys, "stderr", terminal)
     monkeypatch.setattr(Run, "renderer", lambda self, width, height: lambda camera: camera.time)

@@ -1,4 +1,4 @@
-"""What is set before jax starts."""
+"""Settings made before jax starts."""
 
 import importlib.util
 import os
@@ -20,9 +20,7 @@ from l2dgs_jax.runtime import devices
         (None, "0.10.2", None, None),
     ],
 )
-def test_floats_are_added_by_one_instruction_where_that_has_to_be_asked_for(
-    monkeypatch, plugin, version, before, after
-):
+def test_atomic_float_additions_are_enabled_for_cuda_where_needed(monkeypatch, plugin, version, before, after):
     monkeypatch.delenv("XLA_FLAGS", raising=False)
     if before:
         monkeypatch.setenv("XLA_FLAGS", before)

@@ -1,4 +1,4 @@
-"""Packages that may be missing."""
+"""Optional packages."""
 
 import sys
 
@@ -8,7 +8,7 @@ from l2dgs_jax.errors import UserError
 from l2dgs_jax.runtime.extras import extra
 
 
-def test_what_is_there_is_imported_and_what_is_not_is_named_with_its_cure(monkeypatch):
+def test_a_package_is_imported_or_reported_missing_with_its_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "something", pytest)
     assert extra("something", "more", "more") is pytest
     monkeypatch.setitem(sys.modules, "something", None)

@@ -29,7 +29,7 @@ def test_a_file_is_replaced_whole_or_not_at_all(tmp_path):
     assert path.read_text() == "new"
 
 
-def test_a_file_that_cannot_take_its_place_is_a_clear_error_and_leaves_nothing_behind(tmp_path):
+def test_a_file_that_cannot_be_written_is_reported_and_leaves_nothing_behind(tmp_path):
     path = tmp_path / "file.txt"
 
     def fill_the_disk():
@@ -44,8 +44,8 @@ def test_a_file_that_cannot_take_its_place_is_a_clear_error_and_leaves_nothing_b
 
 def test_a_folder_appears_whole_or_not_at_all(tmp_path):
     def fill(path, then=None):
-        with new_folder(path) as place:
-            (place / "a.txt").write_text("a")
+        with new_folder(path) as temporary:
+            (temporary / "a.txt").write_text("a")
             assert not path.exists() or not list(path.iterdir())
             if then:
                 raise then
@@ -61,7 +61,7 @@ def test_a_folder_appears_whole_or_not_at_all(tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["deep", "empty", "new"]
 
 
-def test_a_folder_does_not_take_the_place_of_anything(tmp_path):
+def test_a_new_folder_replaces_nothing(tmp_path):
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "mine").write_text("")
     (tmp_path / "link").symlink_to(tmp_path / "elsewhere")
@@ -74,7 +74,7 @@ def test_a_folder_does_not_take_the_place_of_anything(tmp_path):
             raise AssertionError("entered")
 
 
-def test_a_line_that_cannot_be_added_is_one_sentence(tmp_path):
+def test_a_line_that_cannot_be_added_is_reported_in_one_sentence(tmp_path):
     append_line(tmp_path / "lines", "a")
     append_line(tmp_path / "lines", "b")
     assert (tmp_path / "lines").read_text() == "a\nb\n"
@@ -82,7 +82,7 @@ def test_a_line_that_cannot_be_added_is_one_sentence(tmp_path):
         append_line(tmp_path / "nonsuch" / "lines", "a")
 
 
-def test_json_has_strings_for_numbers_that_it_lacks(tmp_path):
+def test_json_has_strings_for_infinity_and_nan(tmp_path):
     refuse = lambda name: pytest.fail(f"{name} is no JSON")
     infinite = float("inf")
     write_json(tmp_path / "scores.json", {"psnr": infinite, "regions": [{"psnr": -infinite}, (float("nan"), 1.5)]})

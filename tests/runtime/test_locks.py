@@ -1,4 +1,4 @@
-"""A folder that one process at a time works in."""
+"""A folder in which one process works at a time."""
 
 import errno
 import os
@@ -34,7 +34,7 @@ def test_another_process_is_refused_until_the_first_is_gone(tmp_path):
             assert os.listdir(tmp_path) == [LOCK]
 
 
-def test_a_file_system_without_locks_is_warned_of(tmp_path, monkeypatch):
+def test_a_file_system_without_locks_gives_a_warning(tmp_path, monkeypatch):
     def refuse(*_):
         raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
 
@@ -46,6 +46,6 @@ def test_a_file_system_without_locks_is_warned_of(tmp_path, monkeypatch):
         pass
 
 
-def test_a_folder_that_cannot_be_written_to(tmp_path):
+def test_a_folder_that_cannot_be_written_to_is_reported(tmp_path):
     with pytest.raises(UserError, match=r"lock: cannot be written .*expected"), locked(tmp_path / "nonsuch"):
         raise AssertionError("entered")

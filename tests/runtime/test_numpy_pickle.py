@@ -1,4 +1,4 @@
-"""Pickled arrays: what is read from sound files, and that nothing else comes of others."""
+"""Pickled arrays: sound files are read, others are refused without any other effect."""
 
 import os
 import pickle
@@ -40,7 +40,7 @@ def test_arrays_come_back_as_they_were(tmp_path, protocol):
         assert loaded[name].flags.owndata
 
 
-def test_nothing_that_a_file_asks_for_is_run(tmp_path):
+def test_code_in_a_file_is_not_run(tmp_path):
     class Payload:
         def __reduce__(self):
             return os.system, (f"touch {tmp_path / 'run'}",)
@@ -59,28 +59,28 @@ def test_anything_but_dictionaries_of_numbers_is_refused(tmp_path, value):
 
 
 @pytest.mark.parametrize("content", [b"", b"weights", b"\x80\x02."])
-def test_other_files(tmp_path, content):
+def test_other_files_are_refused(tmp_path, content):
     refusal(tmp_path, content)
 
 
-def test_missing_file_and_folder(tmp_path):
+def test_missing_files_and_folders_are_refused(tmp_path):
     for path in (tmp_path / "nonsuch.ckpt", tmp_path):
         with pytest.raises(UserError, match="cannot be read"):
             numpy_pickle.load(path)
 
 
-class OfTheseBytes:
-    """Pickles as an array."""
+class ArrayOfBytes:
+    """Pickles as an array of the given bytes."""
 
     def __init__(self, content):
         self.content = content
 
     def __reduce__(self):
-        made, arguments, _ = np.zeros(1).__reduce__()
-        return made, arguments, (1, (len(self.content),), np.dtype("u1"), False, self.content)
+        rebuild, arguments, _ = np.zeros(1).__reduce__()
+        return rebuild, arguments, (1, (len(self.content),), np.dtype("u1"), False, self.content)
 
 
-def test_what_would_make_a_small_file_a_large_one_is_refused(tmp_path):
+def test_small_files_that_expand_to_large_arrays_are_refused(tmp_path):
     endless: dict = {}
     endless["self"] = endless
     shared = np.zeros(100)
@@ -89,7 +89,7 @@ def test_what_would_make_a_small_file_a_large_one_is_refused(tmp_path):
         doubled = {"a": doubled, "b": doubled}
     long_name = {2**16 * "a": {str(i): np.zeros(1) for i in range(1000)}}
     content = bytes(2**16)
-    shared_bytes = {str(i): OfTheseBytes(content) for i in range(1000)}
+    shared_bytes = {str(i): ArrayOfBytes(content) for i in range(1000)}
     np.testing.assert_array_equal(load(tmp_path, pickle.dumps({"a": shared_bytes["0"]}, 4))["a"], np.zeros(2**16))
     for value in (endless, doubled, {"a": shared, "b": shared}, long_name, shared_bytes):
         frugal_refusal(tmp_path, pickle.dumps(value, 4))
@@ -104,5 +104,5 @@ def test_nested_keys_do_not_exhaust_the_stack(tmp_path):
     refusal(tmp_path, NESTED_KEY)
 
 
-def test_mutated_files(tmp_path):
+def test_mutated_files_are_harmless(tmp_path):
     unsound_files.assert_mutations_are_harmless(numpy_pickle.load, tmp_path, [pickle.dumps(tree(), 4)], 300, 0)

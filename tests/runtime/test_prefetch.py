@@ -6,7 +6,7 @@ import pytest
 from l2dgs_jax.runtime.prefetch import prefetch
 
 
-def test_results_come_in_order_though_computed_at_once():
+def test_results_come_in_order_though_computed_concurrently():
     second_began = threading.Event()
 
     def work(i):
@@ -19,7 +19,7 @@ def test_results_come_in_order_though_computed_at_once():
     assert list(prefetch(work, [])) == []
 
 
-def test_an_endless_series_is_read_only_a_little_ahead():
+def test_an_endless_iterator_is_read_only_a_little_ahead():
     taken = []
     results = prefetch(lambda i: i, (taken.append(i) or i for i in itertools.count()))
     assert [next(results) for _ in range(5)] == list(range(5))

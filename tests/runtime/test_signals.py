@@ -12,22 +12,22 @@ from l2dgs_jax.runtime.signals import STOP_SIGNALS, stop_requests
 
 
 @pytest.fixture(autouse=True)
-def heeded():
-    """Also where the tests run in a shell's background, which ignores interrupts."""
+def interrupts_enabled():
+    """Needed where the tests run in the background of a shell, which ignores interrupts."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
 
 
 @pytest.mark.parametrize("number", STOP_SIGNALS)
-def test_a_signal_is_a_request_and_its_handler_comes_back(number):
+def test_a_signal_is_a_request_and_its_handler_is_restored(number):
     noticed, before = threading.Event(), signal.getsignal(number)
     with stop_requests(noticed.set) as stopping:
         assert stopping() is None
         os.kill(os.getpid(), number)
         assert noticed.wait(10)
         assert stopping() == number
-        os.kill(os.getpid(), signal.SIGTERM)  # not the second Ctrl-C of a person in a hurry
+        os.kill(os.getpid(), signal.SIGTERM)  # not taken for a second Ctrl-C, which ends the process
     assert signal.getsignal(number) == before
     assert signal.set_wakeup_fd(-1) == -1
 
@@ -43,7 +43,7 @@ def test_an_ignored_signal_stays_ignored():
 
 
 def test_a_second_interrupt_ends_the_process_at_once():
-    """Even if Python does not come to run a handler, as in a long compilation."""
+    """Even if Python cannot run a handler, as in a long compilation."""
     program = (
         "from l2dgs_jax.runtime.signals import stop_requests\n"
         "import hashlib\n"

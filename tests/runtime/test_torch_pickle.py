@@ -1,4 +1,4 @@
-"""Files of PyTorch in both formats: what is read from sound ones, and that nothing else comes of others."""
+"""Files of PyTorch in both formats: sound ones are read, others are refused without any other effect."""
 
 import io
 import os
@@ -59,7 +59,7 @@ def test_views_share_a_storage_but_not_their_memory(tmp_path, legacy):
 
 
 @FORMATS
-def test_tensors_of_one_storage_are_at_most_a_few(tmp_path, legacy):
+def test_a_storage_may_be_shared_by_a_few_tensors_only(tmp_path, legacy):
     flat = np.arange(10_000, dtype=np.float32)
     tied, turned = View(flat, 0, (10_000,), (1,)), View(flat, 0, (100, 100), (1, 100))
     for loaded in load(tmp_path, saved({"a": tied, "b": tied, "c": turned}, legacy=legacy)).values():
@@ -69,7 +69,7 @@ def test_tensors_of_one_storage_are_at_most_a_few(tmp_path, legacy):
         assert "larger than the file" in frugal_refusal(tmp_path, saved(many, legacy=legacy))
 
 
-def test_files_of_python_2(tmp_path):
+def test_files_of_python_2_are_read(tmp_path):
     content, raw = state_dict(arrays(), legacy=False)
     loaded = load(tmp_path, zip_file(re.sub(rb"X(.)\0\0\0", rb"U\1", content, flags=re.DOTALL), raw))
     assert list(loaded) == list(arrays())
@@ -88,7 +88,7 @@ class Payload:
 
 @FORMATS
 @pytest.mark.parametrize("protocol", [2, 4])
-def test_code_is_named_and_not_run(tmp_path, legacy, protocol):
+def test_code_is_reported_and_not_run(tmp_path, legacy, protocol):
     target = tmp_path / "ran"
     content = pickle.dumps({"weight": Payload(f"touch {target}")}, protocol)
     assert f"'{os.name}.system'" in refusal(tmp_path, WRAP[legacy](content, {}))
@@ -106,12 +106,12 @@ def test_code_is_named_and_not_run(tmp_path, legacy, protocol):
         "numpy\nload",
     ],
 )
-def test_only_what_tensors_need_is_known(tmp_path, name):
+def test_only_names_that_tensors_need_are_allowed(tmp_path, name):
     message = refusal(tmp_path, zip_file(b"\x80\x02c" + name.encode() + b"\n.", {}))
     assert name.replace("\n", ".") in message
 
 
-def test_dotted_names_do_not_reach_into_what_is_known(tmp_path):
+def test_dotted_names_do_not_reach_into_allowed_classes(tmp_path):
     content = b"\x80\x04\x8c\x0bcollections\x8c\x14OrderedDict.fromkeys\x93."
     assert "OrderedDict.fromkeys" in refusal(tmp_path, zip_file(content, {}))
 
@@ -134,7 +134,7 @@ def test_views_outside_their_storage_are_refused(tmp_path, legacy, view):
 
 
 @FORMATS
-def test_storages_must_be_there_and_whole(tmp_path, legacy):
+def test_missing_or_truncated_storages_are_refused(tmp_path, legacy):
     tensors = {"a": np.zeros(4, np.float32), "b": np.zeros(3, np.float32)}
     content, raw = state_dict(tensors, legacy=legacy)
     assert set(load(tmp_path, WRAP[legacy](content, raw))) == {"a", "b"}
@@ -156,7 +156,7 @@ def test_nested_keys_do_not_exhaust_the_stack(tmp_path):
     refusal(tmp_path, sound.removesuffix(no_storages) + b"\x80\x02]" + NESTED_TUPLES + b"a.")
 
 
-def test_storages_do_not_overlap(tmp_path):
+def test_overlapping_storages_are_refused(tmp_path):
     content, raw = state_dict({"a": np.zeros(2500), "b": np.zeros(2600)}, legacy=False)
     inner = zipfile.ZipInfo("saved/data/0")
     inner.CRC, inner.file_size, inner.compress_size = zlib.crc32(raw["0"]), len(raw["0"]), len(raw["0"])
@@ -177,7 +177,7 @@ def test_anything_but_a_dictionary_of_tensors_is_refused(tmp_path, legacy, value
     assert "dictionary of tensors" in refusal(tmp_path, WRAP[legacy](pickle.dumps(value, 2), {}))
 
 
-def test_byte_order_and_compression(tmp_path):
+def test_big_endian_and_compressed_files_are_refused(tmp_path):
     content, raw = state_dict({"a": np.zeros(2, np.float32)}, legacy=False)
     assert "big-endian" in refusal(tmp_path, zip_file(content, raw, byteorder=b"big"))
     assert "compressed" in refusal(tmp_path, zip_file(content, raw, compression=zipfile.ZIP_DEFLATED))
@@ -186,11 +186,11 @@ def test_byte_order_and_compression(tmp_path):
 
 
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04", b"weights", b"\x80\x02.", pickle.dumps(0, 2)])
-def test_other_files(tmp_path, content):
+def test_other_files_are_refused(tmp_path, content):
     refusal(tmp_path, content)
 
 
-def test_missing_file_and_folder(tmp_path):
+def test_missing_files_and_folders_are_refused(tmp_path):
     for path in (tmp_path / "nonsuch.pth", tmp_path):
         with pytest.raises(UserError, match="cannot be read"):
             torch_pickle.load(path)
@@ -201,10 +201,10 @@ def assert_mutations_are_harmless(folder, count, seed):
     unsound_files.assert_mutations_are_harmless(torch_pickle.load, folder, sound, count, seed)
 
 
-def test_mutated_files(tmp_path):
+def test_mutated_files_are_harmless(tmp_path):
     assert_mutations_are_harmless(tmp_path, 300, 0)
 
 
 @pytest.mark.slow
-def test_many_mutated_files(tmp_path):
+def test_many_mutated_files_are_harmless(tmp_path):
     assert_mutations_are_harmless(tmp_path, 5000, 1)

@@ -16,7 +16,7 @@ STUDIES, RESULTS = sorted(RECORD.glob("studies/*.toml")), sorted(RECORD.glob("re
 
 
 @pytest.mark.parametrize("path", STUDIES, ids=lambda path: path.stem)
-def test_its_studies_can_be_read(path):
+def test_studies_of_the_record_can_be_read(path):
     plans = spec.read(path).plans
     assert {plan.varied["seed"] for plan in plans} == {0, 1, 2}
     assert all(plan.config.downscale == 2 for plan in plans)
@@ -28,7 +28,7 @@ def member(scene, seed, inbetweens, psnr, ended="finished"):
     return found | {"ended": ended, "scores": scores}
 
 
-def test_its_table_has_means_and_spreads_over_seeds(tmp_path):
+def test_the_table_has_means_and_spreads_over_seeds(tmp_path):
     without, found = {"inbetweens": 0.0}, {"first": [], "second": []}
     found["first"] += [member("toys", seed, {}, psnr) for seed, psnr in enumerate((36.0, 36.5, 37.0))]
     found["second"] += [member("toys", seed, without, psnr) for seed, psnr in enumerate((35.0, 35.2))]

@@ -1,4 +1,4 @@
-"""Studies: what a file stands for, what can be trained together, and what is written of it; nothing is trained here."""
+"""Studies: reading their files, grouping their members, and reporting results; nothing is trained here."""
 
 import json
 
@@ -105,14 +105,14 @@ def test_scenes_alone_are_a_study(study):
         ('scenes = ["a"]\n[[variants]]\nname = "x"\n[[variants]]\nname = "x"', "name"),
     ],
 )
-def test_a_malformed_study_is_one_sentence(study, text, naming):
+def test_a_malformed_study_is_refused_in_one_sentence(study, text, naming):
     with pytest.raises(UserError, match=r"study\.toml") as caught:
         read(study(text))
     assert naming in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
-def test_a_missing_file_is_one_sentence(tmp_path, capsys):
+def test_a_missing_file_is_reported_in_one_sentence(tmp_path, capsys):
     with pytest.raises(SystemExit):
         command_line.run(sweep.main, [str(tmp_path / "nonsuch.toml"), str(tmp_path / "out")])
     message = capsys.readouterr().err
@@ -145,7 +145,7 @@ def test_members_of_one_shape_are_one_group(scenes):
     assert a.model.initial_exponents[0] != "auto" != b.model.initial_exponents[0]
 
 
-def test_members_that_brighten_their_frames_have_frames_of_their_own(scenes):
+def test_members_that_brighten_their_frames_form_their_own_group(scenes):
     (scenes / "study.toml").write_text('scenes = ["a"]\npreset = "4dgs"\n[grid]\nenhance = ["none", "gamma"]')
     (dark,), (bright,) = load_groups(read(scenes / "study.toml"))
     assert bright.dataset.train.images.mean() > 1.5 * dark.dataset.train.images.mean()
@@ -157,12 +157,13 @@ def test_members_that_brighten_their_frames_have_frames_of_their_own(scenes):
     [
         ('scenes = ["a", "wide"]', ["image size is 24x18 and 30x18", "wide"]),
         ('scenes = ["a", "long"]', ["number of training frames is 6 and 9"]),
+        ('scenes = ["a", "long"]\npreset = "curve-4dgs"', ["number of training frames is 6 and 9"]),
         ('scenes = ["a", "deep"]', ["having depth is False and True"]),
         ('scenes = ["a"]\n[grid]\nmodel.hidden = [8, 16]', ["model.hidden is 8 and 16"]),
         ('scenes = ["a", "nonsuch"]', ["nonsuch", "no such folder"]),
     ],
 )
-def test_what_cannot_be_trained_together_is_one_sentence(scenes, text, naming):
+def test_members_that_cannot_share_a_program_are_refused_in_one_sentence(scenes, text, naming):
     (scenes / "study.toml").write_text(f"one_program = true\n{text}")
     with pytest.raises(UserError) as caught:
         load_groups(read(scenes / "study.toml"))
@@ -173,7 +174,7 @@ def test_what_cannot_be_trained_together_is_one_sentence(scenes, text, naming):
 
 @pytest.fixture
 def refused(scenes, tmp_path, capsys):
-    """The sentence that a sweep ends in before it trains."""
+    """A function that runs a sweep and returns the sentence with which it is refused."""
     (scenes / "study.toml").write_text('scenes = ["a"]')
 
     def run(*arguments):
@@ -188,7 +189,7 @@ def refused(scenes, tmp_path, capsys):
     return run
 
 
-def test_a_folder_is_not_taken_from_others(refused, tmp_path):
+def test_a_folder_with_other_content_is_refused(refused, tmp_path):
     assert "out" in refused("--resume")
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "notes.txt").touch()
@@ -208,12 +209,12 @@ def test_a_folder_is_not_taken_from_others(refused, tmp_path):
         (["--devices", "0"], "--devices"),
     ],
 )
-def test_bad_options_are_one_sentence(refused, tmp_path, arguments, naming):
+def test_invalid_options_are_refused_in_one_sentence(refused, tmp_path, arguments, naming):
     assert naming in refused(*arguments)
     assert not (tmp_path / "out").exists()
 
 
-def test_a_step_that_leaves_no_member_is_followed_too(monkeypatch):
+def test_the_step_at_which_the_last_member_diverges_is_passed_on(monkeypatch):
     """Even if it is the first: its members must be recorded as diverged."""
     first, last = (engine.Progress(step, None, None, 8) for step in (1, 2))
 

@@ -1,4 +1,4 @@
-"""The preset `curve-4dgs`: a scene whose low light is a tone curve of what is rendered."""
+"""The preset `curve-4dgs`: the low-light image is a tone curve of the rendered one."""
 
 import dataclasses
 
@@ -21,7 +21,7 @@ def dataset():
     return make_dataset()
 
 
-def test_low_light_is_the_shared_curve_of_the_well_lit_image(dataset):
+def test_the_low_light_image_is_the_shared_curve_of_the_well_lit_one(dataset):
     scene = initial_state(dataset, CONFIG).scene
     renderer = Renderer(scene, CONFIG.model, dataset.width, dataset.height, moving=False, sh_degree=1)
     images = renderer(Camera(*(x[0] for x in dataset.train.cameras))).images
@@ -30,17 +30,17 @@ def test_low_light_is_the_shared_curve_of_the_well_lit_image(dataset):
     assert images.welllit.mean() > 2 * images.lowlight.mean()
 
 
-def test_without_low_light_there_is_no_curve(dataset):
+def test_a_preset_without_low_light_has_no_curves(dataset):
     assert initial_state(dataset, tiny("4dgs")).scene.params.curves is None
 
 
 @pytest.mark.slow
 def test_each_frame_learns_its_own_curve(dataset):
-    """Of frames that differ in brightness only, the adjustments come to say by how much."""
+    """Where frames differ in brightness only, the curves learned per frame tell by how much."""
     gains = np.linspace(-0.3, 0.3, FRAMES)
-    still = dataset.train.cameras._replace(viewmat=dataset.train.cameras.viewmat[:1].repeat(FRAMES, 0))
+    same_camera = dataset.train.cameras._replace(viewmat=dataset.train.cameras.viewmat[:1].repeat(FRAMES, 0))
     frames = np.exp(gains)[:, None, None, None] * dataset.train.images[:1].clip(0.05)
-    train = dataclasses.replace(dataset.train, images=frames.astype(np.float16), cameras=still)
+    train = dataclasses.replace(dataset.train, images=frames.astype(np.float16), cameras=same_camera)
     changes = {"optim.curves_lr": 0.02, "coarse_steps": 60, "fine_steps": 0, "loss.equalisation": 0.0}
     config = overrides.replace(CONFIG, changes)
     learned = state_of(finish(dataclasses.replace(dataset, train=train), config)).scene.params.curves

@@ -1,4 +1,4 @@
-"""Clone, split and prune: who, where to, and what happens when rows run out."""
+"""Clone, split and prune: which Gaussians, where the new ones go, and what happens when rows run out."""
 
 import jax
 import jax.numpy as jnp
@@ -35,7 +35,7 @@ def run(rows, alive, statistics, cfg=CFG, key=7):
     return densify(rows, jnp.array(alive), statistics, jnp.array(1.0), jax.random.key(key), cfg)
 
 
-def test_a_small_restless_gaussian_is_cloned_exactly():
+def test_a_small_gaussian_with_a_large_gradient_is_cloned_exactly():
     rows = gaussians(4)
     result = run(rows, [True, True, False, False], stats([0.5, 2.0, 9.0, 9.0]))
     np.testing.assert_array_equal(result.alive, [True, True, True, False])
@@ -47,7 +47,7 @@ def test_a_small_restless_gaussian_is_cloned_exactly():
     assert result.missing == 0
 
 
-def test_a_large_restless_gaussian_splits_into_two_smaller_samples_of_itself():
+def test_a_large_gaussian_with_a_large_gradient_splits_into_two_smaller_samples_of_itself():
     rows = gaussians(2)
     rows = rows._replace(log_scales=jnp.log(jnp.array([[0.5, 1e-6, 1e-6], [0.01] * 3])))
     result = run(rows, [True, False], stats([2.0, 0.0]))
@@ -63,7 +63,7 @@ def test_a_large_restless_gaussian_splits_into_two_smaller_samples_of_itself():
     assert jnp.linalg.norm(offsets[0] - offsets[1]) > 1e-3
 
 
-def test_samples_of_splits_follow_the_gaussian():
+def test_the_centres_of_split_gaussians_have_the_covariance_of_their_source():
     count = 4000
     scales = jnp.array([0.5, 0.2, 0.3])
     rows = jax.tree.map(lambda x: jnp.tile(x[:1], (2 * count, *[1] * (x.ndim - 1))), gaussians(1))
@@ -85,7 +85,7 @@ def test_samples_of_splits_follow_the_gaussian():
     np.testing.assert_allclose(jnp.cov(result.gaussians.means.T), expected, atol=0.02)
 
 
-def test_transparent_gaussians_die_and_their_rows_are_used_again():
+def test_transparent_gaussians_are_pruned_and_their_rows_reused():
     rows = gaussians(3)._replace(logit_opacities=jnp.array([-20.0, 0.0, 0.0]))
     result = run(rows, [True, True, True], stats([5.0, 2.0, 0.0]))
     assert result.alive.all()
@@ -93,13 +93,13 @@ def test_transparent_gaussians_die_and_their_rows_are_used_again():
     np.testing.assert_array_equal(result.gaussians.means[0], rows.means[1])
 
 
-def test_nothing_dies_below_the_count_that_pruning_waits_for():
+def test_nothing_is_pruned_until_the_count_exceeds_prune_above():
     rows = gaussians(2)._replace(logit_opacities=jnp.array([-20.0, 0.0]))
     result = run(rows, [True, True], stats([0.0, 0.0]), DensityConfig(prune_above=2))
     np.testing.assert_array_equal(result.alive, [True, True])
 
 
-def test_missing_rows_are_counted_never_dropped_silently():
+def test_births_without_a_free_row_are_counted_as_missing():
     result = run(gaussians(3), [True, True, False], stats([2.0, 3.0, 0.0]))
     assert result.wanted == 2
     assert result.missing == 1
@@ -107,7 +107,7 @@ def test_missing_rows_are_counted_never_dropped_silently():
 
 
 @pytest.mark.parametrize(("limit", "born"), [(2, 0), (3, 1), (4, 2)])
-def test_the_limit_goes_to_the_largest_gradients(limit, born):
+def test_under_a_limit_the_largest_gradients_are_cloned_first(limit, born):
     cfg = DensityConfig(grad_threshold=1.0, clone_below=0.1, max_gaussians=limit)
     rows = gaussians(6)
     result = run(rows, [True, True, False, False, False, False], stats([2.0, 3.0, 0, 0, 0, 0]), cfg)
@@ -117,13 +117,13 @@ def test_the_limit_goes_to_the_largest_gradients(limit, born):
         np.testing.assert_array_equal(result.gaussians.means[2], rows.means[1])
 
 
-def test_the_threshold_is_on_the_mean_over_sightings():
+def test_the_threshold_applies_to_the_mean_gradient_over_sightings():
     alive = [True, True, True, False, False, False]
     result = run(gaussians(6), alive, stats([3.0, 3.0, 0, 0, 0, 0], [2.0, 4.0, 0, 0, 0, 0]))
     assert result.wanted == 1
 
 
-def test_accumulate_adds_norms_in_normalised_coordinates_and_sightings():
+def test_accumulate_adds_gradient_norms_in_normalised_coordinates_and_counts_sightings():
     gradient = jnp.array([[3.0, 2.0], [0.0, 0.0]])
     radii = jnp.array([2.0, 0.0])
     result = accumulate(stats([1.0, 1.0], [5.0, 5.0]), gradient, radii, 2, 4)
@@ -131,7 +131,7 @@ def test_accumulate_adds_norms_in_normalised_coordinates_and_sightings():
     np.testing.assert_allclose(result.seen, [6.0, 5.0])
 
 
-def test_a_conserving_pair_covers_what_its_source_did():
+def test_with_conserve_opacity_a_pair_has_the_joint_opacity_of_its_source():
     cfg = DensityConfig(grad_threshold=1.0, clone_below=0.1, conserve_opacity=True)
     rows = gaussians(4)._replace(logit_opacities=jnp.array([-3.0, 0.0, 8.0, 0.0]))
     alive = [True, True, True, False]

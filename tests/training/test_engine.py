@@ -37,7 +37,7 @@ def finished(dataset):
 
 
 def objective_of(dataset, config, moving):
-    """The whole objective as a function of the parameters, away from the special values that training starts at."""
+    """The whole objective as a function of the parameters, away from the special initial values."""
     state = initial_state(dataset, config)._replace(step=jnp.asarray(config.sh_warmup, jnp.int32))
     jitter = lambda x, key: x + 0.03 * jax.random.normal(jax.random.key(key), x.shape, x.dtype)
     leaves, treedef = jax.tree.flatten(state.scene.params)
@@ -68,7 +68,7 @@ def random_like(tree, mask, key):
     ("preset", "moving"),
     [("paper", True), pytest.param("authors", True, marks=pytest.mark.slow), ("default", True), ("paper", False)],
 )
-def test_gradient_of_the_whole_objective_by_directional_differences(dataset, preset, moving):
+def test_the_gradient_of_the_whole_objective_matches_finite_differences(dataset, preset, moving):
     value_and_grad, params, probe = objective_of(dataset, tiny(preset), moving)
     value = lambda params: value_and_grad(params, probe)[0]
     gradient = value_and_grad(params, probe)[1]
@@ -95,7 +95,7 @@ def test_gradient_of_the_whole_objective_by_directional_differences(dataset, pre
             assert slope != 0, name
 
 
-def test_probe_gradient_is_the_gradient_of_moving_on_screen(dataset):
+def test_the_probe_gradient_is_the_gradient_by_screen_positions(dataset):
     value_and_grad, params, probe = objective_of(dataset, tiny("paper"), False)
     slope = value_and_grad(params, probe)[1][1]
     direction = jax.random.normal(jax.random.key(0), probe.shape)
@@ -103,7 +103,7 @@ def test_probe_gradient_is_the_gradient_of_moving_on_screen(dataset):
     np.testing.assert_allclose((ahead - behind) / 2e-6, jnp.vdot(slope, direction), rtol=2e-3)
 
 
-def test_nothing_is_learned_from_pixels_that_do_not_count(dataset):
+def test_nothing_is_learned_from_pixels_outside_the_valid_mask(dataset):
     config = tiny()
     valid = np.random.default_rng(0).random((FRAMES, HEIGHT, WIDTH)) < 0.7
     estimate = jax.random.uniform(jax.random.key(0), (2, HEIGHT, WIDTH, 3))
@@ -124,7 +124,7 @@ def test_nothing_is_learned_from_pixels_that_do_not_count(dataset):
     np.testing.assert_allclose(targets[0][1], seen.mean())
 
 
-def test_a_step_takes_a_mask_of_pixels_that_count(dataset):
+def test_a_step_measures_only_the_pixels_of_the_valid_mask(dataset):
     config = tiny()
     state = initial_state(dataset, config)
     probe = jnp.zeros((2, state.scene.alive.shape[0], 2))
@@ -137,11 +137,11 @@ def test_a_step_takes_a_mask_of_pixels_that_count(dataset):
     )
     masks = [jnp.broadcast_to(mask, (2, HEIGHT, WIDTH)) for mask in (half | True, half, ~half)]
     whole, left, right = (10 ** (-report(mask).psnr / 10) for mask in masks)
-    np.testing.assert_allclose(whole, (left + right) / 2, rtol=1e-9)  # mean squares of halves
+    np.testing.assert_allclose(whole, (left + right) / 2, rtol=1e-9)  # MSE of the halves, averaged
     assert not np.isclose(left, right)
 
 
-def test_training_lowers_the_loss_and_grows(dataset):
+def test_training_lowers_the_loss_and_adds_gaussians(dataset):
     config = tiny(coarse_steps=40, fine_steps=0)
     member = engine.Member(dataset.train, config, initial_state(dataset, config))
     reports = [(float(p.report.loss[0]), int(p.states.scene.alive.sum())) for p in engine.run([member])]
@@ -152,19 +152,19 @@ def test_training_lowers_the_loss_and_grows(dataset):
 
 def test_a_resumed_run_equals_the_uninterrupted_one(dataset, finished, tmp_path):
     config = tiny()
-    for stop in (3, 4, 6):
+    for stop_step in (3, 4, 6):
         member = engine.Member(dataset.train, config, initial_state(dataset, config))
         for progress in engine.run([member]):
-            if progress.step == stop:
+            if progress.step == stop_step:
                 saved = Checkpoint(state_of(progress), progress.pair_capacity)
                 checkpoints.save(tmp_path / "c.npz", saved, config)
                 break
         state, pair_capacity, _ = checkpoints.load(tmp_path / "c.npz", config, FRAMES)
-        assert int(state.step) == stop
+        assert int(state.step) == stop_step
         assert_equal_states(finish(dataset, config, state, pair_capacity).states, finished.states)
 
 
-def test_a_small_pair_buffer_grows_and_changes_nothing(dataset, finished):
+def test_a_small_pair_buffer_grows_without_changing_the_result(dataset, finished):
     small = finish(dataset, tiny(), pair_capacity=8)
     assert small.pair_capacity > 8
     for x, y in zip(*map(jax.tree.leaves, (small.states.scene, finished.states.scene)), strict=True):
@@ -172,7 +172,7 @@ def test_a_small_pair_buffer_grows_and_changes_nothing(dataset, finished):
 
 
 @pytest.mark.slow
-def test_a_stage_compiles_once_and_dead_rows_are_inert(dataset):
+def test_each_stage_compiles_once_and_dead_rows_change_nothing(dataset):
     config = tiny(density=DensityConfig(start=1000))
     compiled = engine.train_steps._cache_size()
     plain = state_of(finish(dataset, config, pair_capacity=8192))
@@ -188,10 +188,10 @@ def test_the_first_pair_buffer_fits_the_first_views(dataset):
     config = tiny()
     scene = with_capacity(initial_state(dataset, config), 1500).scene
     gaussians = scene.params.gaussians
-    everywhere = gaussians._replace(
+    image_filling = gaussians._replace(
         means=jnp.zeros_like(gaussians.means).at[:, 2].set(2), log_scales=jnp.ones_like(gaussians.log_scales)
     )
-    scene = scene._replace(params=scene.params._replace(gaussians=everywhere))
+    scene = scene._replace(params=scene.params._replace(gaussians=image_filling))
     tiles = 2 * 2
     for alive in (1000, 1500):
         scene = scene._replace(alive=jnp.arange(1500) < alive)
@@ -199,7 +199,7 @@ def test_the_first_pair_buffer_fits_the_first_views(dataset):
         assert capacity == next_capacity(1.3 * alive * tiles * config.batch_size)
 
 
-def test_the_fine_stage_starts_where_the_coarse_one_ended(dataset):
+def test_the_fine_stage_initially_renders_what_the_coarse_one_does(dataset):
     config = tiny()
     state = initial_state(dataset, config)
     camera = Camera(*(x[2] for x in dataset.train.cameras))
@@ -230,11 +230,11 @@ def test_vmap_over_scenes_equals_a_loop(dataset):
     states = [initial_state(d, config) for d in datasets]
     batches = [load_batch(d.train, np.array([0, 3])) for d in datasets]
     stack = lambda trees: jax.tree.map(lambda *x: jnp.stack([jnp.asarray(v) for v in x]), *trees)
-    take = lambda state, batch: train_step(state, batch, config, moving=True)
-    together, reports = jax.vmap(take)(stack(states), stack(batches))
+    take_step = lambda state, batch: train_step(state, batch, config, moving=True)
+    together, reports = jax.vmap(take_step)(stack(states), stack(batches))
     for index, (state, batch) in enumerate(zip(states, batches, strict=True)):
-        alone, report = take(state, batch)
+        alone, report = take_step(state, batch)
         np.testing.assert_allclose(reports.loss[index], report.loss, rtol=1e-9)
         for x, y in zip(*map(jax.tree.leaves, (together, alone)), strict=True):
-            # Round Gaussians have no gradient in their quaternions but rounding noise, which Adam magnifies.
+            # The quaternions of round Gaussians have no gradient except rounding errors, which Adam magnifies.
             np.testing.assert_allclose(x[index], y, rtol=1e-6, atol=1e-5)

@@ -15,13 +15,13 @@ from l2dgs_jax.training import engine, initial_state, step
 from l2dgs_jax.training.batching import load_batch
 
 STEPS, CAPACITY = 8, 1024
-# Fine stage only, growing after the steps 3 and 6: every program takes long to compile.
+# Fine stage only, as every program takes long to compile; Gaussians are added after steps 3 and 6.
 CONFIG = tiny(
     coarse_steps=0,
     fine_steps=STEPS,
     density=DensityConfig(start=1, stop=100, interval=3, grad_threshold=1e-9, max_gaussians=60),
 )
-OTHER = {
+OTHER_SETTINGS = {
     "seed": 3,
     "loss.exposure_level": 0.3,
     "loss.amplification": 0.1,
@@ -32,32 +32,32 @@ OTHER = {
 
 
 def member(seed, changes=()):
-    """A scene in training, its initial state drawn from the same settings for all."""
+    """A scene in training; the initial states of all members are drawn with the same settings."""
     dataset = make_dataset(seed)
     valid = np.random.default_rng(seed).random((FRAMES, HEIGHT, WIDTH)) < 0.7
     config = overrides.replace(CONFIG, dict(changes))
-    start = initial_state(dataset, CONFIG)
-    # Round Gaussians have no gradient in their quaternions but rounding noise, which Adam magnifies.
-    gaussians = start.scene.params.gaussians
+    initial = initial_state(dataset, CONFIG)
+    # The quaternions of round Gaussians have no gradient except rounding errors, which Adam magnifies.
+    gaussians = initial.scene.params.gaussians
     uneven = gaussians._replace(log_scales=gaussians.log_scales - jnp.array([[0.0, 0.5, 1.0]]))
-    scene = start.scene._replace(params=start.scene.params._replace(gaussians=uneven))
-    state = jax.jit(step.begin_stage, static_argnums=(2, 3))(scene, start.step, config, STEPS)
+    scene = initial.scene._replace(params=initial.scene.params._replace(gaussians=uneven))
+    state = jax.jit(step.begin_stage, static_argnums=(2, 3))(scene, initial.step, config, STEPS)
     return engine.Member(dataclasses.replace(dataset.train, valid=valid), config, state)
 
 
 @pytest.fixture(scope="module")
 def members():
-    return [member(0), member(1, OTHER), member(2)]
+    return [member(0), member(1, OTHER_SETTINGS), member(2)]
 
 
-def last(members, pair_capacity=CAPACITY, mesh=None):
+def final_progress(members, pair_capacity=CAPACITY, mesh=None):
     return collections.deque(engine.run(members, pair_capacity, mesh), maxlen=1).pop()
 
 
 @pytest.fixture(scope="module")
 def alone(members):
     """The last step of each member when trained alone."""
-    return [last([one]) for one in members]
+    return [final_progress([one]) for one in members]
 
 
 def assert_same_training(progress, index, alone):
@@ -74,14 +74,14 @@ def assert_same_training(progress, index, alone):
 
 def test_each_member_trains_as_if_it_were_alone(members, alone):
     compiled = engine.train_steps._cache_size()
-    together = last(members)
+    together = final_progress(members)
     assert engine.train_steps._cache_size() == compiled + 1
     assert [int(progress.states.scene.alive.sum()) for progress in alone] == [60, 45, 60]
     for index, expected in enumerate(alone):
         assert_same_training(together, index, expected)
 
 
-def test_a_member_that_diverges_stays_and_the_others_go_on(members, alone):
+def test_a_member_that_diverges_is_frozen_and_the_others_go_on(members, alone):
     images = members[2].split.images.copy()
     images[2] = np.nan
     broken = members[2]._replace(
@@ -96,13 +96,13 @@ def test_a_member_that_diverges_stays_and_the_others_go_on(members, alone):
     for index in range(2):
         assert_same_training(together, index, alone[index])
     with pytest.raises(engine.DivergedError, match=f"step {frozen}"):
-        last([broken])
+        final_progress([broken])
 
 
 def test_members_that_were_interrupted_at_different_steps_catch_up(members, alone):
     resumed = list(members)
-    for index, stop in ((0, 3), (1, 6), (2, 6)):
-        progress = next(p for p in engine.run([members[index]], CAPACITY) if p.step == stop)
+    for index, stop_step in ((0, 3), (1, 6), (2, 6)):
+        progress = next(p for p in engine.run([members[index]], CAPACITY) if p.step == stop_step)
         resumed[index] = members[index]._replace(state=devices.member(progress.states, 0))
     steps = []
     for together in engine.run(resumed, CAPACITY):
@@ -113,22 +113,22 @@ def test_members_that_were_interrupted_at_different_steps_catch_up(members, alon
 
 
 @pytest.mark.slow
-def test_the_views_of_a_batch_on_several_devices(members, alone):
-    assert_same_training(last(members[:1], mesh=devices.mesh(views=2)), 0, alone[0])
+def test_views_of_a_batch_spread_over_devices_train_the_same(members, alone):
+    assert_same_training(final_progress(members[:1], mesh=devices.mesh(views=2)), 0, alone[0])
 
 
 @pytest.mark.slow
-def test_members_on_several_devices(members, alone):
-    """Three members on two devices: one device has a place to fill up."""
-    spread = last(members, mesh=devices.mesh(2))
+def test_members_spread_over_devices_train_as_if_alone(members, alone):
+    """Three members on two devices: a fourth row is padding."""
+    spread = final_progress(members, mesh=devices.mesh(2))
     assert list(devices.own_rows(spread.report.loss)) == [0, 1, 2, 3]
     for index, expected in enumerate(alone):
         assert_same_training(spread, index, expected)
 
 
 @pytest.mark.slow
-def test_a_small_pair_buffer_grows_for_all(members, alone):
-    together = last(members, pair_capacity=8)
+def test_a_small_pair_buffer_grows_without_changing_any_member(members, alone):
+    together = final_progress(members, pair_capacity=8)
     assert together.pair_capacity > 8
     for index, expected in enumerate(alone):
         assert_same_training(together, index, expected)
@@ -139,10 +139,10 @@ def test_a_small_pair_buffer_grows_for_all(members, alone):
     "forms", [{}, {"density.method": "mcmc", "model.motion_gate": True, "model.unit": "depth"}], ids=["plain", "mcmc"]
 )
 def test_every_setting_that_members_may_differ_in_can_be_traced(forms):
-    """A step whose numbers are traced is the step whose numbers are compiled in."""
+    """A step with traced settings equals one with the same settings compiled in."""
     optional = {"loss.structure_illumination": 0.3, "loss.structure_beta_illumination": 0.2, "optim.decay_steps": 7}
-    one = member(0, optional | {"loss.amplification": 0.02, "loss.gate": 0.03} | forms)
-    config, batch = one.config, load_batch(one.split, np.array([0, 3]))
+    subject = member(0, optional | {"loss.amplification": 0.02, "loss.gate": 0.03} | forms)
+    config, batch = subject.config, load_batch(subject.split, np.array([0, 3]))
     values = {
         name: jax.tree.map(jnp.asarray, value)
         for name, (value, _) in overrides.differences([config, _all_changed(config)]).items()
@@ -151,17 +151,17 @@ def test_every_setting_that_members_may_differ_in_can_be_traced(forms):
 
     @jax.jit
     def traced(state, batch, values):
-        own = overrides.replace(_all_changed(config), values)
-        fresh = step.begin_stage(state.scene, state.step, own, 9)
-        return step.densify(step.train_step(fresh, batch, own, moving=True, pair_capacity=4096)[0], own, 2)
+        settings = overrides.replace(_all_changed(config), values)
+        begun = step.begin_stage(state.scene, state.step, settings, 9)
+        return step.densify(step.train_step(begun, batch, settings, moving=True, pair_capacity=4096)[0], settings, 2)
 
     @jax.jit
     def compiled_in(state, batch):
-        fresh = step.begin_stage(state.scene, state.step, config, 9)
-        return step.densify(step.train_step(fresh, batch, config, moving=True, pair_capacity=4096)[0], config, 2)
+        begun = step.begin_stage(state.scene, state.step, config, 9)
+        return step.densify(step.train_step(begun, batch, config, moving=True, pair_capacity=4096)[0], config, 2)
 
     for x, y in zip(
-        *map(jax.tree.leaves, (traced(one.state, batch, values), compiled_in(one.state, batch))), strict=True
+        *map(jax.tree.leaves, (traced(subject.state, batch, values), compiled_in(subject.state, batch))), strict=True
     ):
         np.testing.assert_allclose(x, y, rtol=1e-6, atol=1e-8)
 

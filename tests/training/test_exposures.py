@@ -1,4 +1,4 @@
-"""Gains of the frames, learned beside the scene."""
+"""Exposure gains of the frames, learned together with the scene."""
 
 import dataclasses
 
@@ -16,11 +16,11 @@ GAINS = np.linspace(-0.3, 0.3, FRAMES)
 
 
 def drifting_dataset(gains=GAINS):
-    """A still scene filmed from one place, the exposure changing."""
+    """A still scene filmed from one place with changing exposure."""
     dataset = make_dataset()
-    still = dataset.train.cameras._replace(viewmat=dataset.train.cameras.viewmat[:1].repeat(FRAMES, 0))
+    same_camera = dataset.train.cameras._replace(viewmat=dataset.train.cameras.viewmat[:1].repeat(FRAMES, 0))
     images = np.exp(gains)[:, None, None, None] * dataset.train.images[:1].clip(0.05)
-    train = dataclasses.replace(dataset.train, images=images.astype(np.float16), cameras=still)
+    train = dataclasses.replace(dataset.train, images=images.astype(np.float16), cameras=same_camera)
     return dataclasses.replace(dataset, train=train)
 
 
@@ -29,7 +29,7 @@ def config_of(exposure, **changes):
 
 
 @pytest.mark.parametrize(("gains", "found"), [(GAINS, "drifting"), (0.03 * GAINS, "steady")])
-def test_whether_exposure_drifts_is_found_from_the_frames(gains, found):
+def test_drifting_exposure_is_detected_from_the_frames(gains, found):
     assert resolve(config_of("auto"), drifting_dataset(gains)).model.exposure == found
 
 
@@ -39,32 +39,32 @@ def test_training_starts_from_the_gains_that_the_frames_show():
     assert initial_state(drifting_dataset(), config_of("steady")).scene.params.exposures is None
 
 
-def test_estimates_are_exposed_like_their_frames():
+def test_renderings_are_exposed_like_their_frames():
     images = jnp.full((2, 3, 4, 3), 0.2)
     exposures = jnp.log(jnp.array([[1.0, 1, 1], [2, 4, 8], [1, 0.25, 0.125]]))
-    seen = objective.exposed(images, exposures, jnp.array([1, 2]))
+    exposed = objective.exposed(images, exposures, jnp.array([1, 2]))
     # Relative to their geometric mean, which is [2, 1, 1]^(1/3).
-    np.testing.assert_allclose(seen[0, 0, 0], 0.2 * np.array([2, 4, 8]) / np.array([2 ** (1 / 3), 1, 1]), rtol=1e-6)
+    np.testing.assert_allclose(exposed[0, 0, 0], 0.2 * np.array([2, 4, 8]) / np.array([2 ** (1 / 3), 1, 1]), rtol=1e-6)
     np.testing.assert_allclose(
-        seen[1, 0, 0], 0.2 * np.array([1, 0.25, 0.125]) / np.array([2 ** (1 / 3), 1, 1]), rtol=1e-6
+        exposed[1, 0, 0], 0.2 * np.array([1, 0.25, 0.125]) / np.array([2 ** (1 / 3), 1, 1]), rtol=1e-6
     )
     check_grads(lambda *x: objective.exposed(*map(jnp.asarray, x), jnp.array([1, 2])), (images, exposures), 1)
 
 
 @pytest.mark.slow
-def test_training_moves_the_gains_to_what_the_frames_say():
+def test_training_recovers_the_gains_of_the_frames():
     dataset = drifting_dataset()
     changes = {"optim.exposures_lr": 0.02, "loss.ssim": 0.0, "coarse_steps": 100, "fine_steps": 0}
     config = config_of("drifting", **changes)
     start = initial_state(dataset, config)
     params = start.scene.params
-    blind = params._replace(exposures=jnp.zeros_like(params.exposures))
-    learned = state_of(finish(dataset, config, start._replace(scene=start.scene._replace(params=blind))))
+    without_gains = params._replace(exposures=jnp.zeros_like(params.exposures))
+    learned = state_of(finish(dataset, config, start._replace(scene=start.scene._replace(params=without_gains))))
     gains = np.asarray(learned.scene.params.exposures).mean(-1)
     assert np.corrcoef(gains, GAINS)[0, 1] > 0.9
     assert np.ptp(gains) > 0.3
 
 
-def test_a_frame_knows_which_one_it_is():
+def test_a_batch_contains_the_indices_of_its_frames():
     batch = load_batch(make_dataset().train, np.array([4, 1]))
     np.testing.assert_array_equal(batch.frames, [4, 1])

@@ -15,19 +15,19 @@ disagreement = jax.jit(depth_disagreement)
 
 
 def views(seed=0, noise=0.2):
-    """Rendered depth and alpha, and depth that differs from it by more than scale and shift, with gaps in both."""
+    """Rendered depth and alpha, and given depth that differs by more than scale and shift, with gaps in both."""
     rng = np.random.default_rng(seed)
     alpha = rng.uniform(0.6, 1, (V, H, W))
     distance = rng.uniform(1, 4, (V, H, W))
-    told = 0.3 + 2 / distance * (1 + noise * rng.normal(size=distance.shape))
+    inverse = 0.3 + 2 / distance * (1 + noise * rng.normal(size=distance.shape))
     alpha[0, 0, :3] = 0.2
-    told[:, 2, 3:5] = 0
-    given = np.divide(1, told, out=np.zeros_like(told), where=told > 0)
+    inverse[:, 2, 3:5] = 0
+    given = np.divide(1, inverse, out=np.zeros_like(inverse), where=inverse > 0)
     return jnp.asarray(alpha * distance), jnp.asarray(alpha), jnp.asarray(given)
 
 
 def expected(depth, alpha, given):
-    """The least mean over lines, found by another solver."""
+    """The least mean over lines (scale and shift of inverse depth), found by another solver."""
     total = 0.0
     for d, a, g in zip(*map(np.asarray, (depth, alpha, given)), strict=True):
         known = (g > 0) & (a > 0.5)
@@ -42,42 +42,42 @@ def expected(depth, alpha, given):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_it_is_the_least_mean_difference_over_scales_and_shifts(seed):
+def test_disagreement_is_the_least_mean_difference_over_scales_and_shifts(seed):
     arrays = views(seed)
     np.testing.assert_allclose(disagreement(*arrays), expected(*arrays), rtol=1e-4)
 
 
 @settings(deadline=None, max_examples=30)
 @given(scale=st.floats(0.01, 100), shift=st.floats(0, 3), unit=st.floats(0.01, 100))
-def test_scale_shift_and_unit_do_not_count(scale, shift, unit):
-    depth, alpha, told = views()
-    other = jnp.where(told > 0, 1 / (scale * (1 / jnp.where(told > 0, told, 1) + shift)), 0)
-    np.testing.assert_allclose(disagreement(unit * depth, alpha, other), disagreement(depth, alpha, told), rtol=1e-6)
+def test_disagreement_ignores_scale_shift_and_unit(scale, shift, unit):
+    depth, alpha, target = views()
+    other = jnp.where(target > 0, 1 / (scale * (1 / jnp.where(target > 0, target, 1) + shift)), 0)
+    np.testing.assert_allclose(disagreement(unit * depth, alpha, other), disagreement(depth, alpha, target), rtol=1e-6)
 
 
-def test_what_agrees_costs_nothing_and_opacity_is_not_depth():
+def test_equal_distances_cost_nothing_whatever_the_opacity():
     depth, alpha, _ = views()
     distance = depth / alpha
     np.testing.assert_allclose(disagreement(depth, alpha, distance), 0, atol=1e-12)
     fainter = 0.8 * alpha.at[0, 0, :3].set(1)
     np.testing.assert_allclose(disagreement(fainter * distance, fainter, distance), 0, atol=1e-12)
-    assert disagreement(depth, alpha, 5 - distance) > 0.1  # near is far
+    assert disagreement(depth, alpha, 5 - distance) > 0.1  # near and far swapped
 
 
 def test_gradients(monkeypatch):
-    """They are those of the least mean; the search comes as close to it as its rounds allow."""
-    depth, alpha, told = views()
-    near = jax.grad(depth_disagreement, (0, 1))(depth, alpha, told)
+    """Gradients are those of the exact minimum; few iterations of the fit come within 5 % of them."""
+    depth, alpha, target = views()
+    few_iterations = jax.grad(depth_disagreement, (0, 1))(depth, alpha, target)
     monkeypatch.setattr(given_depth, "FIT_ITERATIONS", 1000)
-    function = jax.jit(lambda depth, alpha: depth_disagreement(depth, alpha, told))
+    function = jax.jit(lambda depth, alpha: depth_disagreement(depth, alpha, target))
     check_grads(function, (depth, alpha), order=1, modes=("rev",), eps=1e-6, atol=1e-7, rtol=1e-5)
-    for x, y in zip(near, jax.grad(function, (0, 1))(depth, alpha), strict=True):
+    for x, y in zip(few_iterations, jax.grad(function, (0, 1))(depth, alpha), strict=True):
         assert np.linalg.norm(x - y) < 0.05 * np.linalg.norm(y)
 
 
 @pytest.mark.parametrize("level", [0.0, 1e-6, 1.0])
 @pytest.mark.parametrize("told", ["nothing", "one pixel", "the same everywhere", "extremes"])
-def test_what_tells_nothing_is_finite_in_single_precision(level, told):
+def test_uninformative_depth_gives_finite_values_in_single_precision(level, told):
     given = {
         "nothing": np.zeros((V, H, W)),
         "one pixel": np.eye(H, W)[None].repeat(V, 0) * (np.arange(H) == 2)[:, None],
@@ -92,7 +92,7 @@ def test_what_tells_nothing_is_finite_in_single_precision(level, told):
     assert value < 1e-6
 
 
-def test_the_total_is_the_mean_over_views():
+def test_disagreement_is_the_mean_over_views():
     arrays = views()
     each = [disagreement(*(x[v : v + 1] for x in arrays)) for v in range(V)]
     np.testing.assert_allclose(disagreement(*arrays), np.mean(each), rtol=1e-9)

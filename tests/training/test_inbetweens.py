@@ -1,4 +1,4 @@
-"""Views between frames: against what a moving texture really looks like there."""
+"""Views interpolated between frames, compared with how a moving texture really looks at that time."""
 
 import dataclasses
 
@@ -29,7 +29,7 @@ def texture(columns, rows):
 
 
 def picture(time):
-    """What is seen `time` frames after the first: everything moves to the right."""
+    """The image `time` frames after the first: everything moves to the right."""
     columns, rows = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
     return texture(columns - SPEED * time, rows)
 
@@ -50,12 +50,12 @@ def flows(split):
     return neighbour_flows(split, filled=True)
 
 
-def test_frames_follow_each_other_in_time(flows):
-    np.testing.assert_array_equal(flows.following, [4, 3, 2, 0, 2])  # the last one has none to follow it
+def test_following_frames_are_in_order_of_time(flows):
+    np.testing.assert_array_equal(flows.following, [4, 3, 2, 0, 2])  # frame 2 is the last in time
 
 
 @pytest.mark.parametrize("part", [0.25, 0.5, 0.8])
-def test_a_view_between_two_frames_shows_what_is_there(split, flows, part):
+def test_a_view_between_two_frames_shows_the_true_image(split, flows, part):
     view = draw(split, flows, frame=3, part=part)  # the second in time
     truth = picture(1 + part)
     inner = np.zeros((HEIGHT, WIDTH), bool)
@@ -69,7 +69,7 @@ def test_a_view_between_two_frames_shows_what_is_there(split, flows, part):
     np.testing.assert_allclose(view.camera.viewmat[0, 3], -0.1 * (1 + part), rtol=1e-5)
 
 
-def test_depth_is_learned_at_frames_and_where_they_are_valid_only(split, flows):
+def test_depth_is_given_only_at_valid_pixels_of_real_frames(split, flows):
     depths = np.full(split.images.shape[:-1], 2.0, np.float32)
     valid = np.ones(depths.shape, bool)
     valid[:, :5] = False
@@ -85,39 +85,39 @@ def test_depth_is_learned_at_frames_and_where_they_are_valid_only(split, flows):
     assert (depths == 2).all()
 
 
-def test_what_only_one_frame_shows_is_left_out(split):
+def test_content_of_only_one_frame_is_invalid_between_frames(split):
     images = split.images.copy()
     images[3][PATCH] = 0.4
     view = draw(dataclasses.replace(split, images=images), neighbour_flows(split), frame=3, part=0.5)
-    moved = slice(20, 44), slice(34, 60)  # where both the patch and what it should be come to lie
+    moved = slice(20, 44), slice(34, 60)  # where both the patch and the texture it replaces move to
     assert view.valid[moved].mean() < 0.1
     assert view.valid[:16].mean() > 0.7
     assert not view.image[~view.valid].any()
 
 
-def test_edges_may_be_a_pixel_off(split):
+def test_edges_may_differ_by_a_pixel_but_not_by_five(split):
     rng = np.random.default_rng(0)
     stripes = np.where(np.arange(WIDTH) // 16 % 2, 0.3, 0.1)[None, :, None] * np.ones((HEIGHT, 1, 3))
     images = np.tile(stripes, (FRAMES, 1, 1, 1)) + rng.normal(0, 0.002, (FRAMES, HEIGHT, WIDTH, 3))
-    still = Flows(np.array([4, 3, 2, 0, 2]), np.zeros((FRAMES, 2, HEIGHT, WIDTH, 2), np.float16))
+    no_motion = Flows(np.array([4, 3, 2, 0, 2]), np.zeros((FRAMES, 2, HEIGHT, WIDTH, 2), np.float16))
     shares = []
-    for off in (1, 5):
-        images[0] = np.roll(images[3], off, axis=1)
-        view = draw(dataclasses.replace(split, images=images.astype(np.float16)), still, frame=3, part=0.5)
+    for shift in (1, 5):
+        images[0] = np.roll(images[3], shift, axis=1)
+        view = draw(dataclasses.replace(split, images=images.astype(np.float16)), no_motion, frame=3, part=0.5)
         shares.append(view.valid[:, 8:-8].mean())
     assert shares[0] > 0.95
     assert shares[1] < 0.8
 
 
-def test_pixels_that_are_not_valid_stay_so(split, flows):
+def test_invalid_pixels_stay_invalid_between_frames(split, flows):
     valid = np.ones(split.images.shape[:3], bool)
     valid[3, :, 40:50] = False
     view = draw(dataclasses.replace(split, valid=valid), flows, frame=3, part=0.5)
-    assert not view.valid[:, 43:48].any()
-    assert view.valid[:, 20:36].mean() > 0.7
+    assert not view.valid[:, 43:52].any()  # where their content has moved to
+    assert view.valid[:, 20:40].mean() > 0.7
 
 
-def test_of_several_cameras_the_nearest_one_follows():
+def test_with_several_cameras_a_frame_of_the_nearest_one_follows():
     cameras = make_dataset().train.cameras
     rig = Camera(*(np.concatenate([x, x]) for x in cameras))
     rig.viewmat[6:, 1, 3] += 5
@@ -126,7 +126,7 @@ def test_of_several_cameras_the_nearest_one_follows():
     np.testing.assert_array_equal(following, [1, 2, 3, 4, 5, 5, 7, 8, 9, 10, 11, 11])
 
 
-def test_frames_that_do_not_match_are_not_mixed():
+def test_frames_that_do_not_match_are_not_interpolated():
     noise = np.random.default_rng(0).uniform(0, 0.3, (FRAMES, HEIGHT, WIDTH, 3)).astype(np.float16)
     cameras = Camera(*(x[:FRAMES] for x in make_dataset().train.cameras))
     np.testing.assert_array_equal(
@@ -134,32 +134,32 @@ def test_frames_that_do_not_match_are_not_mixed():
     )
 
 
-def test_after_a_cut_nothing_is_mixed(split):
+def test_frames_across_a_cut_are_not_interpolated(split):
     images = split.images.copy()
-    images[2] = images[2, ::-1, ::-1] ** 2  # the last one in time
+    images[2] = images[2, ::-1, ::-1] ** 2  # the last in time
     following = neighbour_flows(dataclasses.replace(split, images=images), filled=True).following
     np.testing.assert_array_equal(following, [4, 3, 2, 0, 4])
 
 
-def test_smooth_flow_finds_what_patches_lose():
-    """Of every fourth frame of a real clip, the frames in the middle are drawn."""
+def test_filled_flow_gives_more_correct_pixels():
+    """Given every fourth frame of a real clip, the frames half-way between are interpolated."""
     whole = load_dataset("demo").train
     order = np.argsort(whole.cameras.time)[:17]
     kept = order[::4]
     few = Split(tuple(map(str, kept)), Camera(*(x[kept] for x in whole.cameras)), whole.images[kept])
 
-    def right(filled):
+    def correct_share(filled):
         flows, shares = neighbour_flows(few, filled=filled), []
         for frame, middle in enumerate(order[2::4]):
             view = draw(few, flows, frame, part=0.5)
-            apart = np.abs(view.image.astype(float) - whole.images[middle]).mean(-1)
-            shares.append(np.mean(view.valid & (apart < 0.02)))
+            error = np.abs(view.image.astype(float) - whole.images[middle]).mean(-1)
+            shares.append(np.mean(view.valid & (error < 0.02)))
         return np.mean(shares)
 
-    assert right(filled=True) > 1.2 * right(filled=False)
+    assert correct_share(filled=True) > 1.2 * correct_share(filled=False)
 
 
-def test_cameras_between_cameras():
+def test_between_interpolates_centres_rotations_intrinsics_and_time():
     rotations = Rotation.from_euler("y", [[0], [40]], degrees=True).as_matrix()
     viewmat = np.tile(np.eye(4), (2, 1, 1))
     viewmat[:, :3, :3] = rotations
@@ -188,40 +188,41 @@ def test_batches_mix_frames_and_views_between_them(split, flows):
             plain = load_batch(split, np.array([frame]))
             is_frame = bool(batch.cameras.time[row] == plain.cameras.time[0])
             kinds.append(is_frame)
-            assert batch.frames[row] == frame
+            assert batch.frames[row] == np.abs(split.cameras.time - batch.cameras.time[row]).argmin()
             if is_frame:
                 np.testing.assert_array_equal(batch.images[row], plain.images[0])
                 assert batch.valid[row].all()
             else:
                 assert 0 <= batch.cameras.time[row] - plain.cameras.time[0] <= 1 / (FRAMES - 1) + 1e-6
                 assert not batch.valid[row].all()
-    # Of five frames the last has none to follow it.
+    # No view is drawn after the last of the five frames.
     assert 0.4 < np.mean(kinds) < 0.8
 
 
-def test_more_is_drawn_where_more_time_passes(split, flows):
-    times = np.array([0.0, 0.1, 0.2, 0.4, 1.0], np.float32)  # of the frames in order; by index they are 1, 3, 0, 4, 2
+def test_longer_gaps_between_frames_are_interpolated_more_often(split, flows):
+    times = np.array([0.0, 0.1, 0.2, 0.4, 1.0], np.float32)  # in order of time; these are the frames 1, 3, 0, 4, 2
     cameras = split.cameras._replace(time=times[[2, 0, 4, 1, 3]])
     uneven = dataclasses.replace(split, cameras=cameras)
     counts = np.zeros((2, FRAMES))
     for step in range(400):
-        batch = next_batch(uneven, tiny(inbetweens=0.4, batch_size=2), step, flows)
-        between_frames = batch.cameras.time != cameras.time[batch.frames]
-        np.add.at(counts, (between_frames.astype(int), batch.frames), 1)
+        config = tiny(inbetweens=0.4, batch_size=2)
+        frames = view_indices(config.seed, step, 2, FRAMES)
+        between_frames = next_batch(uneven, config, step, flows).cameras.time != cameras.time[frames]
+        np.add.at(counts, (between_frames.astype(int), frames), 1)
     share = counts[1] / counts.sum(0)
-    assert share[2] == 0  # the last
-    gaps = np.array([0.2, 0.1, 0, 0.1, 0.6])  # by index, 0.25 in the mean
+    assert share[2] == 0  # the last in time
+    gaps = np.array([0.2, 0.1, 0, 0.1, 0.6])  # by frame, 0.25 on average
     np.testing.assert_allclose(share, 0.4 * gaps / (0.6 * 0.25 + 0.4 * gaps), atol=0.1)
 
 
-def test_without_any_the_frames_are_all_there_is(split):
+def test_without_inbetweens_batches_consist_of_frames(split):
     batch = next_batch(split, tiny(), 3, None)
     np.testing.assert_array_equal(batch.images, split.images[batch.frames])
     assert batch.valid is None
 
 
 @pytest.mark.slow
-def test_a_training_with_them_resumes_where_it_stopped():
+def test_a_training_with_inbetweens_resumes_exactly():
     dataset, config = make_dataset(), tiny(inbetweens=0.9, coarse_steps=0, fine_steps=4)
     steps = engine.run([engine.Member(dataset.train, config, initial_state(dataset, config))])
     states = [jax.device_get(state_of(progress)) for progress in steps]

@@ -56,7 +56,7 @@ def grads_agree(function, *arguments, modes=("fwd", "rev")):
     check_grads(jax.jit(function), arguments, order=1, modes=modes, eps=1e-6, atol=1e-6, rtol=1e-5)
 
 
-# Plain transcriptions of the equations, a loop over pixels each.
+# Plain transcriptions of the equations, each a loop over pixels.
 
 
 def pixels(height=H, width=W):
@@ -64,7 +64,7 @@ def pixels(height=H, width=W):
 
 
 def at(image, v, y, x):
-    """The pixel, or zeros beyond the image."""
+    """A pixel, or zeros outside the image."""
     inside = 0 <= y < image.shape[1] and 0 <= x < image.shape[2]
     return image[v, y, x] if inside else np.zeros_like(image[v, 0, 0])
 
@@ -171,7 +171,7 @@ def test_exposure_is_eq_11(window, form):
     grads_agree(lambda image: losses.exposure(image, 0.6, window, form), image)
 
 
-def test_exposure_leaves_cut_blocks_out():
+def test_exposure_leaves_out_incomplete_blocks():
     image = jnp.full((V, H, W, 3), 0.6).at[:, 6:].set(1.0)
     assert losses.exposure(image, 0.6, 3, "absolute") < 1e-12 < losses.exposure(image, 0.6, None, "absolute")
 
@@ -209,7 +209,7 @@ def test_total_variation_is_the_mean_step_in_x_plus_the_mean_step_in_y():
     grads_agree(losses.total_variation, image)
 
 
-def test_exponent_prior_pulls_the_first_exponent_alone():
+def test_the_exponent_prior_concerns_the_first_exponent_only():
     attenuation = 1 + 9 * uniform(9, V, H, W, 2)
     b1 = np.ravel(attenuation[..., 0])
     close(losses.exponent_prior(attenuation, 1.2), np.mean([abs(b - 1.2) for b in b1]))
@@ -217,7 +217,7 @@ def test_exponent_prior_pulls_the_first_exponent_alone():
     assert not jax.grad(losses.exponent_prior)(attenuation, 1.2)[..., 1].any()
 
 
-def test_eta_decays_exponentially_and_then_stays():
+def test_eta_decays_exponentially_and_then_stays_constant():
     cfg = LossConfig(eta_start=0.9, eta_end=0.4)
     for step, expected in ((0, 0.9), (50, 0.6), (100, 0.4), (150, 0.4)):
         close(losses.eta(step, 100, cfg), expected)
@@ -232,12 +232,12 @@ def test_total_is_eq_15(cfg):
     images = jax.tree.map(np.asarray, render.images)
     target = np.asarray(target)
     exposed = images.reflectance if cfg.exposure_of == "reflectance" else images.welllit
-    lit = [(image + cfg.eps) ** eta for image in (images.lowlight, target)]
+    tonemapped = [(image + cfg.eps) ** eta for image in (images.lowlight, target)]
     b1, b2 = images.attenuation[..., :1], images.attenuation[..., 1:]
     form = cfg.structure_gradient
     expected = {
         "l1": (1.0, expected_l1(images.lowlight, target, cfg.l1_on, eta, cfg.eps)),
-        "ssim": (1.0, expected_ssim(*lit)),
+        "ssim": (1.0, expected_ssim(*tonemapped)),
         "exposure": (
             cfg.exposure,
             expected_exposure(exposed, cfg.exposure_level, cfg.exposure_window, cfg.exposure_form),
@@ -260,19 +260,19 @@ def test_total_is_eq_15(cfg):
     close(value, sum(weight * term for weight, term in expected.values()))
 
 
-def test_the_structure_terms_have_weights_and_scales_of_their_own():
+def test_the_structure_terms_have_their_own_weights_and_scales():
     render, target = make_render(), uniform(20, V, H, W, 3)
     images = jax.tree.map(np.asarray, render.images)
     cfg = LossConfig(structure=0.3, structure_illumination=2.0, structure_beta=0.2, structure_beta_illumination=0.7)
-    only = dataclasses.replace(cfg, ssim=0.0, exposure=0.0, amplification=0.0, depth=0.0)
-    value, terms = losses.total(render, target, only, 0.8)
+    structure_only = dataclasses.replace(cfg, ssim=0.0, exposure=0.0, amplification=0.0, depth=0.0)
+    value, terms = losses.total(render, target, structure_only, 0.8)
     b1, b2 = images.attenuation[..., :1], images.attenuation[..., 1:]
     close(terms["structure_reflectance"], expected_structure(b1, images.reflectance, 0.2, "components"))
     close(terms["structure_illumination"], expected_structure(b2, images.illumination[..., None], 0.7, "components"))
     close(value, terms["l1"] + 0.3 * terms["structure_reflectance"] + 2.0 * terms["structure_illumination"])
 
 
-def test_reflectance_is_amplified_as_illumination_is():
+def test_reflectance_amplification_is_the_mean_distance_to_one():
     render, target = make_render(), uniform(20, V, H, W, 3)
     plain, _ = losses.total(render, target, LossConfig(), 0.8)
     value, terms = losses.total(render, target, LossConfig(reflectance_amplification=0.05), 0.8)
@@ -303,9 +303,9 @@ def test_gradients_of_the_total(cfg):
 @pytest.mark.parametrize("size", [(1, 1), (1, 6), (5, 4)], ids=str)
 def test_extremes_are_finite_in_single_precision(cfg, size):
     dtype = jnp.float32
-    for level, eta, goal in itertools.product((0.0, 1.0), (0.95, 0.5), (0.0, 1.0)):
+    for level, eta, target_level in itertools.product((0.0, 1.0), (0.95, 0.5), (0.0, 1.0)):
         render = constant_render(level, *size, dtype)
-        target = jnp.full((1, *size, 3), goal, dtype)
+        target = jnp.full((1, *size, 3), target_level, dtype)
         (value, _), grad = value_and_grad(render, target, cfg, eta)
         assert value.dtype == dtype
         assert jnp.isfinite(value)
@@ -331,9 +331,9 @@ def test_the_total_is_the_mean_over_views():
     render, target = make_render(), uniform(20, V, H, W, 3)
     (both, _), _ = value_and_grad(render, target, EVERY_TERM, 0.8)
 
-    def one(v):
+    def total_of_view(v):
         view = jax.tree.map(lambda x: x[v : v + 1] if x.ndim else x, render)
         (value, _), _ = value_and_grad(view, target[v : v + 1], EVERY_TERM, 0.8)
         return value
 
-    close(both, (one(0) + one(1)) / 2)
+    close(both, (total_of_view(0) + total_of_view(1)) / 2)

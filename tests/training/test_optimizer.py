@@ -1,4 +1,4 @@
-"""Adam against its closed form, groups, schedules, and jaxopt as the driver."""
+"""Adam compared with a plain NumPy version; parameter groups, schedules, and jaxopt driving the steps."""
 
 import subprocess
 import sys
@@ -28,7 +28,7 @@ def numpy_adam(value, gradients, rates, beta1, beta2, eps):
     return value
 
 
-def test_adam_matches_the_closed_form_in_every_group():
+def test_adam_matches_numpy_in_every_group():
     rng = np.random.default_rng(0)
     params = {"a": jnp.array(rng.normal(size=3)), "b": (jnp.array(rng.normal(size=(2, 2))),)}
     groups = {"a": "fast", "b": ("slow",)}
@@ -63,7 +63,7 @@ def test_rows_without_gradient_do_not_move():
     np.testing.assert_array_equal(step, 0)
 
 
-def test_jaxopt_drives_it_and_one_vmapped_update_serves_different_rates():
+def test_jaxopt_minimises_with_adam_and_one_vmapped_update_serves_different_rates():
     target = jnp.array([1.0, -2.0])
 
     def value_and_grad(x):
@@ -86,7 +86,7 @@ def test_jaxopt_drives_it_and_one_vmapped_update_serves_different_rates():
     assert jnp.sum((steps(0.2, 60) - target) ** 2) < 0.1
 
 
-def test_schedule_decays_exponentially_and_stays():
+def test_a_schedule_decays_exponentially_and_then_stays_constant():
     schedule = optimizer.Schedule(jnp.array(1.0), jnp.array(0.01), jnp.array(100.0))
     rates = [float(optimizer.learning_rate(schedule, jnp.array(count))) for count in (0, 50, 100, 1000)]
     np.testing.assert_allclose(rates, [1.0, 0.1, 0.01, 0.01], rtol=1e-6)
@@ -97,7 +97,7 @@ def test_a_rate_of_zero_freezes_its_group():
     assert float(optimizer.learning_rate(schedule, jnp.array(7))) == 0
 
 
-def test_extent_scales_the_groups_it_should():
+def test_the_extent_scales_the_rates_of_the_groups_named():
     cfg = OptimConfig(extent_scales=("means",), decay_steps=None)
     plain, scaled = (schedules(cfg, jnp.array(extent), 70) for extent in (1.0, 3.0))
     for name in plain:

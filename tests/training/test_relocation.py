@@ -1,4 +1,4 @@
-"""Relocation, births and noise: the image nearly stays, the number is met, only faint Gaussians wander."""
+"""Relocation, births and noise (MCMC): the image hardly changes, counts are met, only faint Gaussians are moved."""
 
 import dataclasses
 
@@ -43,7 +43,7 @@ def draw(rows, alive):
 
 
 @pytest.mark.parametrize("count", [41, 60, 90])
-def test_births_leave_the_image_nearly_as_it_was(count):
+def test_births_hardly_change_the_image(count):
     rows = gaussians(np.tile(np.linspace(0.1, 0.95, 10), 9))
     alive = jnp.arange(90) < 40
     result = relocate(rows, alive, jnp.array(count), jax.random.key(1), DEAD)
@@ -60,7 +60,7 @@ def test_births_leave_the_image_nearly_as_it_was(count):
 
 @pytest.mark.parametrize("copies", [1, 2, 5, 30])
 @pytest.mark.parametrize("opacity", [0.01, 0.3, 0.9, 0.999])
-def test_together_the_copies_cover_what_their_source_did(opacity, copies):
+def test_copies_have_the_joint_opacity_and_integral_of_their_source(opacity, copies):
     rows = gaussians([opacity] + [0.5] * copies)
     result = relocate(rows, jnp.arange(copies + 1) < 1, jnp.array(copies + 1), jax.random.key(0), DEAD)
     for before, after in zip(jax.tree.leaves(rows), jax.tree.leaves(result.gaussians), strict=True):
@@ -75,44 +75,44 @@ def test_together_the_copies_cover_what_their_source_did(opacity, copies):
 
 
 @pytest.mark.parametrize("copies", [1, 3])
-def test_copies_are_parted_and_keep_centroid_and_covariance(copies):
+def test_spread_copies_keep_centroid_and_covariance(copies):
     count, spread = 2000, 0.6
     rows = jax.tree.map(lambda x: jnp.tile(x[:1], (count * (copies + 1), *[1] * (x.ndim - 1))), gaussians([0.3]))
     alive = jnp.arange(len(rows.means)) < 1
     whole = relocate(rows, alive, jnp.array(copies + 1), jax.random.key(0), DEAD).gaussians
 
     @jax.vmap
-    def parted(key):
+    def spread_out(key):
         few = jax.tree.map(lambda x: x[: copies + 1], rows)
         return relocate(few, alive[: copies + 1], jnp.array(copies + 1), key, DEAD, spread).gaussians
 
-    found = parted(jax.random.split(jax.random.key(1), count))
-    np.testing.assert_allclose(found.means.mean(1), np.tile(rows.means[:1], (count, 1)), atol=1e-12)
-    own = np.exp(np.asarray(found.log_scales[0, 0]))
+    copies_found = spread_out(jax.random.split(jax.random.key(1), count))
+    np.testing.assert_allclose(copies_found.means.mean(1), np.tile(rows.means[:1], (count, 1)), atol=1e-12)
+    own = np.exp(np.asarray(copies_found.log_scales[0, 0]))
     size = np.exp(np.asarray(whole.log_scales[0]))
     np.testing.assert_allclose(own, size * np.sqrt(1 - spread**2), rtol=1e-9)
     turn = Rotation.from_quat(rows.quats[0], scalar_first=True).as_matrix()
-    offsets = (np.asarray(found.means) - np.asarray(rows.means[0])) @ turn
+    offsets = (np.asarray(copies_found.means) - np.asarray(rows.means[0])) @ turn
     together = np.cov(offsets.reshape(-1, 3).T) + np.diag(own**2)
     np.testing.assert_allclose(together, np.diag(size**2), atol=0.05 * size.max() ** 2)
 
 
-def test_parted_births_leave_the_image_nearly_as_it_was():
+def test_spread_births_hardly_change_the_image():
     rows = gaussians(np.tile(np.linspace(0.1, 0.95, 10), 9))
     alive = jnp.arange(90) < 40
     before = draw(rows, alive)
     changes = []
     for spread in (0.5, 0.9):
         result = relocate(rows, alive, jnp.array(60), jax.random.key(1), DEAD, spread)
-        still = ~np.asarray(result.changed)
+        unchanged = ~np.asarray(result.changed)
         for old, new in zip(jax.tree.leaves(rows), jax.tree.leaves(result.gaussians), strict=True):
-            np.testing.assert_array_equal(new[still], old[still])
+            np.testing.assert_array_equal(new[unchanged], old[unchanged])
         changes.append(float(jnp.abs(draw(result.gaussians, result.alive).alpha - before.alpha).mean()))
     assert changes[0] < 0.03
     assert changes[0] < changes[1]
 
 
-def test_the_dead_go_where_the_living_are_and_the_others_stay():
+def test_dead_gaussians_are_relocated_to_living_ones_and_the_others_stay():
     rows = gaussians([0.4, 0.001, 0.9, 0.002, 0.6])
     alive = jnp.array([True, True, True, True, False])
     result = relocate(rows, alive, jnp.array(4), jax.random.key(3), DEAD)
@@ -135,34 +135,34 @@ def test_sources_are_drawn_in_proportion_to_their_opacity():
     np.testing.assert_allclose(drawn, opacities / opacities.sum(), atol=0.03)
 
 
-def test_sources_are_drawn_by_their_need_and_by_opacity_where_none_is_in_need():
+def test_sources_are_drawn_by_need_or_by_opacity_if_no_need_is_positive():
     opacities = np.array([0.2, 0.2, 0.8])
     rows = gaussians(np.append(opacities, np.full(4000, 0.5)))
     alive = jnp.arange(4003) < 3
     for need, chances in (([1e-5, 3e-5, 0.0], [1, 3, 0]), ([0.0, 0.0, 0.0], opacities)):
-        everyone = jnp.asarray(np.append(need, np.full(4000, 7.0)))
-        result = relocate(rows, alive, jnp.array(4003), jax.random.key(0), DEAD, 0.0, everyone)
+        needs = jnp.asarray(np.append(need, np.full(4000, 7.0)))
+        result = relocate(rows, alive, jnp.array(4003), jax.random.key(0), DEAD, 0.0, needs)
         means = np.asarray(result.gaussians.means)
         drawn = [np.all(means[3:] == mean[None], axis=1).mean() for mean in means[:3]]
         np.testing.assert_allclose(drawn, np.array(chances) / np.sum(chances), atol=0.03)
 
 
-def test_where_nothing_lives_nothing_is_born():
+def test_without_living_gaussians_none_are_born():
     rows = gaussians([0.001, 0.002, 0.5])
     result = relocate(rows, jnp.array([True, True, False]), jnp.array(3), jax.random.key(0), DEAD)
     assert not result.changed.any()
     assert all(bool(jnp.isfinite(x).all()) for x in jax.tree.leaves(result.gaussians))
 
 
-def test_the_number_grows_by_equal_factors_and_ends_where_it_should():
-    numbers = [100]
+def test_the_count_grows_by_equal_factors_up_to_the_limit():
+    counts = [100]
     for left in (4, 3, 2, 1):
-        numbers.append(int(population(jnp.array(numbers[-1]), 1600, left)))
-    np.testing.assert_allclose(numbers, [100, 200, 400, 800, 1600], atol=1)
+        counts.append(int(population(jnp.array(counts[-1]), 1600, left)))
+    np.testing.assert_allclose(counts, [100, 200, 400, 800, 1600], atol=1)
     assert int(population(jnp.array(1700), 1600, 3)) == 1700
 
 
-def test_only_faint_gaussians_wander_and_by_their_own_covariance():
+def test_noise_moves_only_faint_gaussians_according_to_their_covariance():
     count = 20_000
     rows = gaussians(np.full(count, 1e-6))
     rows = rows._replace(
@@ -183,8 +183,8 @@ def test_only_faint_gaussians_wander_and_by_their_own_covariance():
     expected = (0.7 * gate) ** 2 * covariance @ covariance
     np.testing.assert_allclose(np.cov(steps.T), expected, atol=0.05 * expected.max())
     solid = rows._replace(logit_opacities=jnp.full(count, 0.0))
-    still = disturb(solid, alive, jnp.array(0.7), jax.random.key(0), DEAD)
-    assert float(jnp.abs(still.means - rows.means).max()) < 1e-12
+    moved_solid = disturb(solid, alive, jnp.array(0.7), jax.random.key(0), DEAD)
+    assert float(jnp.abs(moved_solid.means - rows.means).max()) < 1e-12
 
 
 def growing(**changes):
@@ -196,22 +196,22 @@ def growing(**changes):
 
 
 @pytest.mark.slow
-def test_training_meets_the_number_and_compiles_once():
+def test_training_reaches_the_limit_and_compiles_once():
     dataset, config = make_dataset(), growing()
     state = initial_state(dataset, config)
     assert len(state.scene.alive) == 64
     engine._densify_all.clear_cache()
-    numbers = []
+    counts = []
     member = engine.Member(dataset.train, config, state)
     for progress in engine.run([member]):
-        numbers.append(int(progress.states.scene.alive.sum()))
-    assert (numbers[0], numbers[-1]) == (25, 64)
-    assert numbers == sorted(numbers)
-    assert len(set(numbers)) == 5
+        counts.append(int(progress.states.scene.alive.sum()))
+    assert (counts[0], counts[-1]) == (25, 64)
+    assert counts == sorted(counts)
+    assert len(set(counts)) == 5
     assert engine._densify_all._cache_size() == 1
 
 
-def test_births_of_a_training_are_parted_by_its_spread():
+def test_births_in_training_use_the_spread_of_the_settings():
     dataset = make_dataset()
     for spread in (0.0, 0.5):
         config = growing(spread=spread, noise=0.0)
@@ -221,16 +221,16 @@ def test_births_of_a_training_are_parted_by_its_spread():
         assert (len(means), len(np.unique(means, axis=0))) == (64, 64 if spread else 25)
 
 
-def test_births_of_a_training_go_where_gradients_are():
+def test_births_in_training_can_be_drawn_by_gradient():
     dataset, config = make_dataset(), growing(drawn_by="gradient")
     state = initial_state(dataset, config)
-    one = state.stats._replace(gradient=state.stats.gradient.at[3].set(1e-4))
-    grown, _ = jax.jit(densify, static_argnums=1)(state._replace(stats=one), config, 1)
+    one_gradient = state.stats._replace(gradient=state.stats.gradient.at[3].set(1e-4))
+    grown, _ = jax.jit(densify, static_argnums=1)(state._replace(stats=one_gradient), config, 1)
     colors, source = np.asarray(grown.scene.params.gaussians.reflectance), state.scene.params.gaussians.reflectance[3]
     assert (colors == np.asarray(source)[None]).all(-1).sum() == 64 - 25 + 1
 
 
-def test_noise_is_wired_to_its_strength_and_fades_with_the_learning_rate():
+def test_noise_in_training_is_proportional_to_its_strength_and_the_learning_rate():
     dataset, config = make_dataset(), growing()
     faint = dataclasses.replace(config, model=dataclasses.replace(config.model, initial_opacity=0.004))
     state = initial_state(dataset, faint)

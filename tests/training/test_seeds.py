@@ -1,4 +1,4 @@
-"""Tracks and seeds, on a square that moves before the camera of a clip, and Gaussians with paths in a training."""
+"""Seeds (new Gaussians with paths) found on the moving square of a clip, and their training."""
 
 import dataclasses
 import functools
@@ -26,7 +26,7 @@ K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]], np.floa
 
 
 def surfaces():
-    """Points on the wall, the floor and the board of the clip; none are on what moves."""
+    """Points on the wall, the floor and the board of the clip; none on the moving square."""
     x, y = np.meshgrid(np.linspace(-4, 4, 40), np.linspace(-3, 0.9, 25))
     wall = np.stack([x, y, np.full_like(x, 2.0)], axis=-1)
     x, z = np.meshgrid(np.linspace(-4, 4, 40), np.linspace(-2, 2, 30))
@@ -52,8 +52,8 @@ def found():
     return find_seeds(surfaces(), filmed(block=True)[0], MANY)
 
 
-def seen(seeds, split, frame):
-    """Pixels where the seeds that live in a frame are seen in it, by their paths."""
+def projected(seeds, split, frame):
+    """Pixels to which the seeds alive in a frame project, displaced by their paths."""
     time, viewmat = float(split.cameras.time[frame]), split.cameras.viewmat[frame]
     live = (seeds.lifetimes[:, 0] <= time) & (time <= seeds.lifetimes[:, 1])
     weights = np.asarray(path_weights(jnp.array([time]), seeds.paths.shape[1]))[0]
@@ -62,9 +62,9 @@ def seen(seeds, split, frame):
 
 
 @pytest.mark.parametrize("frame", [2, 6, 11])
-def test_seeds_follow_what_moves_and_cover_it(frame):
+def test_seeds_follow_and_cover_the_moving_square(frame):
     split, squares = filmed(block=True)
-    columns, rows = np.clip(seen(found(), split, frame).astype(int), 0, [WIDTH - 1, HEIGHT - 1]).T
+    columns, rows = np.clip(projected(found(), split, frame).astype(int), 0, [WIDTH - 1, HEIGHT - 1]).T
     square = squares[frame].astype(np.uint8)
     assert cv2.dilate(square, np.ones((9, 9), np.uint8))[rows, columns].mean() > 0.85
     covered = np.zeros_like(square)
@@ -72,7 +72,7 @@ def test_seeds_follow_what_moves_and_cover_it(frame):
     assert cv2.dilate(covered, np.ones((9, 9), np.uint8))[square > 0].mean() > 0.85
 
 
-def test_seeds_have_the_colours_of_what_they_are_on():
+def test_seeds_have_the_colours_of_the_moving_square():
     split, squares = filmed(block=True)
     shown = np.concatenate([image[square] for image, square in zip(split.images, squares, strict=True)])
     np.testing.assert_allclose(found().colors.mean(0), shown.mean(0), atol=0.01)
@@ -83,15 +83,24 @@ def test_where_nothing_moves_there_are_no_seeds():
     assert len(find_seeds(surfaces(), filmed(block=False)[0], MANY).points) < 0.03 * len(found().points)
 
 
-def test_there_are_no_more_seeds_than_wanted_and_the_longest_are_kept():
+def test_the_number_of_seeds_is_limited_and_the_longest_lived_are_kept():
     few = find_seeds(surfaces(), filmed(block=True)[0], 20)
     length = lambda seeds: seeds.lifetimes[:, 1] - seeds.lifetimes[:, 0]
     assert len(few.points) == 20
     assert length(few).min() >= np.sort(length(found()))[-60]
 
 
+def test_seeds_of_the_first_and_of_the_last_frame_are_visible_before_and_after_these():
+    split = filmed(block=True)[0]
+    cameras = split.cameras._replace(time=np.linspace(0.1, 0.9, COUNT, dtype=np.float32))
+    first, last = find_seeds(surfaces(), dataclasses.replace(split, cameras=cameras), MANY).lifetimes.T
+    visible = lambda time: np.count_nonzero((first <= time) & (time <= last))
+    assert visible(0.0) == visible(cameras.time[0]) > 0
+    assert visible(1.0) == visible(cameras.time[-1]) > 0
+
+
 @pytest.mark.parametrize("why", ["noise", "no points in view", "not valid"])
-def test_where_flow_or_depth_cannot_tell_there_are_no_seeds(why):
+def test_without_reliable_flow_or_depth_there_are_no_seeds(why):
     split, points = filmed(block=True)[0], surfaces()
     if why == "noise":
         images = np.random.default_rng(0).uniform(0, 0.3, split.images.shape).astype(np.float16)
@@ -104,7 +113,7 @@ def test_where_flow_or_depth_cannot_tell_there_are_no_seeds(why):
     assert [x.shape for x in seeds] == [(0, 3), (0, 3), (0,), (0, path_knots(COUNT), 3), (0, 2)]
 
 
-SOME = Seeds(
+TWO_SEEDS = Seeds(
     points=np.array([[0.1, 0.2, 2.5], [-0.3, 0.1, 2.2]], np.float32),
     colors=np.array([[0.1, 0.12, 0.11], [0.2, 0.1, 0.05]], np.float32),
     spacings=np.array([0.1, 0.2], np.float32),
@@ -115,9 +124,9 @@ SOME = Seeds(
 
 @pytest.fixture
 def tracked(monkeypatch):
-    """Settings and a state that starts from the two seeds."""
+    """Settings and an initial state with the two seeds."""
     module = sys.modules["l2dgs_jax.training.initial_state"]  # its function has the same name
-    monkeypatch.setattr(module, "find_seeds", lambda *_, most: SOME)
+    monkeypatch.setattr(module, "find_seeds", lambda *_, most: TWO_SEEDS)
     config = tiny(coarse_steps=3, fine_steps=0)
     config = dataclasses.replace(config, model=dataclasses.replace(config.model, tracks=True))
     return config, initial_state(make_dataset(), config)
@@ -128,9 +137,9 @@ def test_a_training_starts_with_the_seeds_after_the_points(tracked):
     points = len(make_dataset().points)
     gaussians = jax.tree.map(lambda rows: np.asarray(rows)[points : points + 2], scene.params.gaussians)
     assert int(scene.alive.sum()) == points + 2
-    np.testing.assert_allclose(gaussians.means, SOME.points)
-    np.testing.assert_allclose(gaussians.paths, SOME.paths)
-    np.testing.assert_allclose(gaussians.lifetimes, SOME.lifetimes)
+    np.testing.assert_allclose(gaussians.means, TWO_SEEDS.points)
+    np.testing.assert_allclose(gaussians.paths, TWO_SEEDS.paths)
+    np.testing.assert_allclose(gaussians.lifetimes, TWO_SEEDS.lifetimes)
     first, second = gaussians.reflectance
     assert first[0] < second[0]
     assert first[2] > second[2]
@@ -148,7 +157,7 @@ def test_only_seeds_learn_their_paths(tracked):
     assert (moved[points:] > 0).all()
 
 
-def test_paths_are_born_and_saved_with_their_gaussians(tracked, tmp_path):
+def test_paths_are_copied_at_births_and_saved_in_checkpoints(tracked, tmp_path):
     config, state = tracked
     gaussians, alive = state.scene.params.gaussians, state.scene.alive
     born = relocation.relocate(gaussians, alive, alive.sum() + 8, jax.random.key(0), 0.0)

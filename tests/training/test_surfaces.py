@@ -1,4 +1,4 @@
-"""Points that flow adds on what stands still: the wall, the floor and the board of a clip whose square moves."""
+"""Points added by optical flow on static surfaces: wall, floor and board of a clip in which a square moves."""
 
 import dataclasses
 import functools
@@ -52,28 +52,28 @@ def found(noise=0.0):
     return fused(sparse(), maps(noise), MANY)
 
 
-def off(points):
-    """How far points are from the nearest surface of the clip that stands still."""
+def distance_to_surfaces(points):
+    """Distances of points from the nearest static surface of the clip."""
     x, y, z = points.T
     board = np.maximum(np.abs(x - 0.7), np.abs(y - 0.3)) < 0.65
     return np.minimum(np.minimum(np.abs(z - 2), np.abs(y - 1)), np.where(board, np.abs(z - 0.6), np.inf))
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.01])
-def test_points_lie_on_surfaces(noise):
-    distances = off(found(noise))
+def test_added_points_lie_on_surfaces(noise):
+    distances = distance_to_surfaces(found(noise))
     assert len(distances) > 1000
     assert np.median(distances) < 0.03
-    assert np.quantile(distances, 0.95) < 0.15  # the camera is 3.5 to 5.5 from them
+    assert np.quantile(distances, 0.95) < 0.15  # the camera is 3.5 to 5.5 away from the surfaces
 
 
-def test_none_are_where_something_moves():
+def test_no_points_are_added_on_the_moving_square():
     above_floor = np.abs(found()[:, 1] - 1) > 0.2
     assert np.mean(above_floor & (np.abs(found()[:, 2] - SQUARE_AT) < 0.3)) < 0.01
 
 
 @pytest.mark.parametrize("frame", [3, 5, 8])
-def test_points_cover_what_stands_still(frame):
+def test_points_cover_the_static_parts_of_a_frame(frame):
     split, squares = filmed()
     pixels, _ = project_points(found(), split.cameras.viewmat[frame], split.cameras.K[frame])
     inside = ((pixels >= 0) & (pixels < (WIDTH, HEIGHT))).all(-1)
@@ -84,18 +84,18 @@ def test_points_cover_what_stands_still(frame):
     assert cells[still].mean() > 0.8
 
 
-def test_points_are_added_only_where_there_are_none():
+def test_few_points_are_added_where_there_are_points_already():
     again = fused(np.concatenate([sparse(), found()]), maps(), MANY)
     assert len(again) < 0.2 * len(found())
 
 
-def test_no_more_than_wanted_are_added():
-    some = fused(sparse(), maps(), 200)
-    assert 0 < len(some) <= 200
+def test_the_number_of_added_points_is_limited():
+    limited = fused(sparse(), maps(), 200)
+    assert 0 < len(limited) <= 200
     assert len(find_surfaces(sparse(), filmed()[0], 0)) == 0
 
 
-def test_pixels_that_do_not_count_get_no_points():
+def test_invalid_pixels_get_no_points():
     split, _ = filmed()
     valid = np.ones(split.images.shape[:3], bool)
     valid[..., : WIDTH // 2] = False
@@ -106,7 +106,7 @@ def test_pixels_that_do_not_count_get_no_points():
 
 
 @pytest.mark.parametrize("turned", [0.0, 0.05])
-def test_cameras_in_one_place_see_no_depth(turned):
+def test_cameras_in_one_place_give_no_points(turned):
     split, _ = filmed(block=False)
     angles = turned * np.arange(COUNT)
     viewmat = np.tile(split.cameras.viewmat[5], (COUNT, 1, 1)).astype(np.float64)
@@ -117,7 +117,7 @@ def test_cameras_in_one_place_see_no_depth(turned):
     assert len(find_surfaces(sparse(), dataclasses.replace(split, cameras=cameras), MANY)) == 0
 
 
-def test_no_point_is_added_without_any_in_view():
+def test_without_known_points_in_view_none_are_added():
     behind = sparse() * np.float32([1, 1, 0]) - np.float32([0, 0, 20])
     assert len(find_surfaces(behind, filmed()[0], MANY)) == 0
 
@@ -139,18 +139,18 @@ def test_triangulation_finds_depths_in_spite_of_false_matches(scale):
     truth = np.linspace(1 / 6, 1 / 2, HEIGHT * WIDTH).reshape(HEIGHT, WIDTH) / scale
     pixels = pixel_indices(HEIGHT, WIDTH) + 0.5
     matches = np.stack([project(geometry, pixels, truth) for geometry in geometries]).astype(np.float32)
-    matches[1, :60] += 15  # one of the views is wrong over there
+    matches[1, :60] += 15  # false matches in one view
     trusted = np.ones(matches.shape[:3], bool)
     trusted[2:, 120:] = False
-    trusted[1:, 150:] = False  # one match is no evidence
+    trusted[1:, 150:] = False  # a single match is not enough
     geometry = EpipolarGeometry(*map(np.stack, zip(*geometries, strict=True)))
-    told = triangulated(geometry, matches, trusted, (0.01 / scale, 2 / scale))
-    assert np.isnan(told[150:]).all()
-    assert np.isfinite(told[:150]).mean() > 0.99
-    np.testing.assert_allclose(told[:150], truth[:150], rtol=1e-3)
+    depth = triangulated(geometry, matches, trusted, (0.01 / scale, 2 / scale))
+    assert np.isnan(depth[150:]).all()
+    assert np.isfinite(depth[:150]).mean() > 0.99
+    np.testing.assert_allclose(depth[:150], truth[:150], rtol=1e-3)
 
 
-def test_training_starts_from_points_that_were_added(monkeypatch):
+def test_training_starts_from_the_added_points_too(monkeypatch):
     dataset = make_dataset()
     added = np.random.default_rng(0).uniform([-1, -0.7, 2], [1, 0.7, 3], (7, 3)).astype(np.float32)
     monkeypatch.setattr(sys.modules[initial_state.__module__], "find_surfaces", lambda *_, most: added[:most])
@@ -162,7 +162,7 @@ def test_training_starts_from_points_that_were_added(monkeypatch):
     assert all(np.isclose(means, point, atol=1e-6).all(-1).any() for point in added)
 
 
-def test_depth_is_looked_for_in_as_many_frames_as_are_worth_it(monkeypatch):
+def test_depth_maps_are_computed_for_at_most_max_frames(monkeypatch):
     monkeypatch.setattr(surfaces, "MAX_FRAMES", 4)
     split, _ = filmed()
     np.testing.assert_allclose([m.viewmat for m in depth_maps(sparse(), split)], split.cameras.viewmat[[0, 3, 6, 9]])

@@ -1,4 +1,4 @@
-"""What lengths are measured in: a scene of another size, and a camera that stands still, train alike."""
+"""The unit of lengths: training does not depend on the size of the scene, and works with a static camera."""
 
 import dataclasses
 
@@ -12,7 +12,7 @@ from l2dgs_jax.training import initial_state
 
 
 def configure(unit, method="mcmc"):
-    """Settings without what makes steps of rounding: Adam on turns of round Gaussians, and pixels about to clip."""
+    """Settings under which nothing magnifies rounding errors: neither Adam in quaternions nor pixels about to clip."""
     config = tiny(coarse_steps=0, fine_steps=8)
     rates = {"means_lr": 1e-2, "heads_lr": 1e-2, "quats_lr": 0.0, "eps": 1e-40}
     return dataclasses.replace(
@@ -35,7 +35,7 @@ def scaled(dataset, factor):
 
 
 def trained(dataset, config):
-    """The scene at the end, and what its first and last view show."""
+    """The trained scene, and its renderings for the first and last camera."""
     scene = state_of(finish(dataset, config)).scene
     renderer = Renderer(scene, config.model, dataset.width, dataset.height, moving=True, sh_degree=1)
     return scene, [renderer(dataset.train.camera(i)) for i in (0, -1)]
@@ -63,7 +63,7 @@ def test_a_scene_of_another_size_trains_to_the_same_images(factor, method):
 
 
 @pytest.mark.slow
-def test_without_units_the_motion_depends_on_the_size():
+def test_in_world_units_the_images_depend_on_the_size():
     dataset, config = make_dataset(), configure("world")
     views = [trained(scaled(dataset, factor), config)[1][-1].images.lowlight for factor in (1.0, 1000.0)]
     assert float(np.abs(views[0] - views[1]).max()) > 4e-3

@@ -1,4 +1,4 @@
-"""Every schedule reaches the step that it is meant for: the numbers of a whole run, not only the formulas."""
+"""Schedules and weights as a whole run applies them at each step, not only their formulas."""
 
 import dataclasses
 from functools import partial
@@ -32,8 +32,8 @@ def config_of(**changes):
     return overrides.replace(tiny(coarse_steps=COARSE, fine_steps=FINE, sh_warmup=4), changes)
 
 
-def passed_on(dataset, monkeypatch, config, moving):
-    """A function of a step's number: the exponent of Eq. 10, the target of B1's prior and the SH bands that it uses."""
+def spied_objective(dataset, monkeypatch, config, moving):
+    """A function of the step number: the exponent of Eq. 10, the target of B1's prior and the SH degree used there."""
     seen = {}
     render, total = objective.render, losses.total
 
@@ -51,14 +51,14 @@ def passed_on(dataset, monkeypatch, config, moving):
     probe = jnp.zeros((2, len(state.scene.alive), 2))
 
     @jax.jit
-    def look(number):
+    def evaluate(number):
         objective.objective(state.scene.params, probe, state._replace(step=number), batch, config, moving, 4096)
         return dict(seen)
 
-    return lambda number: {name: float(value) for name, value in look(jnp.int32(number)).items()}
+    return lambda number: {name: float(value) for name, value in evaluate(jnp.int32(number)).items()}
 
 
-# Over the whole run the exponent falls from 0.9 to 0.4; if it restarts, it does so within either stage.
+# The exponent falls from 0.9 to 0.4 over the whole run or, if it restarts, within each stage.
 @pytest.mark.parametrize(
     ("restarts", "moving", "progress"),
     [
@@ -68,25 +68,25 @@ def passed_on(dataset, monkeypatch, config, moving):
         (True, True, {COARSE: 0, 16: 6 / 15}),
     ],
 )
-def test_the_exponent_of_the_tone_curve(dataset, monkeypatch, restarts, moving, progress):
+def test_the_exponent_of_eq_10_decays_over_the_run_or_each_stage(dataset, monkeypatch, restarts, moving, progress):
     config = config_of(**{"loss.eta_start": 0.9, "loss.eta_end": 0.4, "loss.eta_restarts": restarts})
-    look = passed_on(dataset, monkeypatch, config, moving)
+    values_at = spied_objective(dataset, monkeypatch, config, moving)
     for number, part in progress.items():
-        np.testing.assert_allclose(look(number)["eta"], 0.9 * (0.4 / 0.9) ** part, rtol=1e-6)
+        np.testing.assert_allclose(values_at(number)["eta"], 0.9 * (0.4 / 0.9) ** part, rtol=1e-6)
 
 
 @pytest.mark.parametrize(("moving", "degrees"), [(False, {0: 0, 3: 0, 4: 1, 8: 2}), (True, {11: 2, 12: 3, 24: 3})])
-def test_the_bands_of_the_illumination(dataset, monkeypatch, moving, degrees):
+def test_the_sh_degree_of_the_illumination_rises_with_the_steps(dataset, monkeypatch, moving, degrees):
     config = config_of()
     config = dataclasses.replace(config, model=dataclasses.replace(config.model, sh_degree=3))
-    look = passed_on(dataset, monkeypatch, config, moving)
-    assert {number: look(number)["sh_degree"] for number in degrees} == degrees
+    values_at = spied_objective(dataset, monkeypatch, config, moving)
+    assert {number: values_at(number)["sh_degree"] for number in degrees} == degrees
 
 
 @pytest.mark.parametrize(("exponents", "target"), [((1.7, 9.0), 1.7), (None, 1.0)])
-def test_the_prior_of_the_exponent_pulls_to_its_start(dataset, monkeypatch, exponents, target):
+def test_the_target_of_the_exponent_prior_is_its_initial_value(dataset, monkeypatch, exponents, target):
     config = config_of(**{"model.initial_exponents": exponents})
-    assert passed_on(dataset, monkeypatch, config, False)(0)["exponent_target"] == target
+    assert spied_objective(dataset, monkeypatch, config, False)(0)["exponent_target"] == target
 
 
 def test_the_planes_are_smoothed_in_the_fine_stage_only(dataset):
@@ -110,10 +110,10 @@ def test_the_planes_are_smoothed_in_the_fine_stage_only(dataset):
 
 @pytest.fixture
 def journal(monkeypatch):
-    """What `engine.run` does at which step, without any training."""
+    """A record of what `engine.run` calls at which step; nothing is trained."""
     entries = SimpleNamespace(steps=[], stages=[], growths=[], growths_left=[])
 
-    def take(states, batches, values, number, *, config, moving, pair_capacity, mesh):
+    def train_steps(states, batches, values, number, *, config, moving, pair_capacity, mesh):
         entries.steps.append((number, moving, np.asarray(batches.cameras.time)[0].tolist()))
         report = StepReport(*[jnp.zeros(1)] * 6)
         return states._replace(step=states.step + 1), report, engine.Tally(0, 1)
@@ -129,7 +129,7 @@ def journal(monkeypatch):
         entries.growths_left.append(left)
         return states
 
-    monkeypatch.setattr(engine, "train_steps", take)
+    monkeypatch.setattr(engine, "train_steps", train_steps)
     monkeypatch.setattr(engine, "begin_fine_stage", begin_fine_stage)
     monkeypatch.setattr(engine, "densify_all", densify_all)
     return entries
@@ -140,7 +140,7 @@ def run(dataset, config, state=None):
     return [(p.step, jax.tree.map(np.asarray, devices.member(p.states, 0))) for p in engine.run([member], 4096)]
 
 
-def test_stages_views_and_growth_of_a_run(dataset, journal):
+def test_a_run_has_its_stages_views_and_densifications_at_the_right_steps(dataset, journal):
     density = DensityConfig(start=2, stop=9, interval=3)
     config = dataclasses.replace(config_of(seed=5), density=density)
     states = dict(run(dataset, config))
@@ -155,13 +155,13 @@ def test_stages_views_and_growth_of_a_run(dataset, journal):
     assert states[COARSE + FINE].step == COARSE + FINE
 
 
-def test_growth_that_never_starts(dataset, journal):
+def test_densification_that_stops_before_it_starts_never_happens(dataset, journal):
     run(dataset, dataclasses.replace(config_of(), density=DensityConfig(start=2, stop=0, interval=3)))
     assert journal.growths == []
 
 
 @pytest.mark.parametrize(("decay_steps", "coarse", "fine"), [(None, COARSE, FINE), (7, 7, 7)])
-def test_rates_decay_over_their_stage(dataset, journal, decay_steps, coarse, fine):
+def test_learning_rates_decay_over_their_stage_or_decay_steps(dataset, journal, decay_steps, coarse, fine):
     config = config_of(**{"optim.decay_steps": decay_steps})
     states = dict(run(dataset, config))
     extent = float(states[1].scene.extent)
@@ -172,7 +172,7 @@ def test_rates_decay_over_their_stage(dataset, journal, decay_steps, coarse, fin
         np.testing.assert_allclose(schedules["bafe"].start, config.optim.bafe_lr)
 
 
-def test_the_optimizer_starts_anew_with_the_fine_stage_and_not_when_a_run_goes_on(dataset, journal):
+def test_adam_is_reset_at_the_fine_stage_but_not_on_resuming(dataset, journal):
     config = config_of()
     state = initial_state(dataset, config)
     used = jax.tree.map(lambda x: x + 1 if x.dtype == float else x, state.adam.mu)
@@ -187,7 +187,7 @@ def test_the_optimizer_starts_anew_with_the_fine_stage_and_not_when_a_run_goes_o
 
 @pytest.mark.slow
 def test_every_rate_moves_its_parameters_and_no_others(dataset):
-    # Bounds would move the reflectances that the noise below puts beyond them, whatever their rate.
+    # Bounds would clip the reflectances that the noise below puts outside them, whatever their rate.
     config = config_of(**{"model.motion_gate": True, "model.bounded_reflectance": False})
     state, batch = initial_state(dataset, config), batch_of(dataset.train, [0, 3])
     leaves, treedef = jax.tree.flatten(state.scene.params)
@@ -195,26 +195,25 @@ def test_every_rate_moves_its_parameters_and_no_others(dataset):
     leaves = [x + 0.03 * jax.random.normal(key, x.shape) for x, key in zip(leaves, keys, strict=True)]
     params = treedef.unflatten(leaves)
     state = state._replace(scene=state.scene._replace(params=params), step=jnp.int32(20))
-    take = jax.jit(lambda state: train_step(state, batch, config, moving=True, pair_capacity=4096)[0])
+    take_step = jax.jit(lambda state: train_step(state, batch, config, moving=True, pair_capacity=4096)[0])
     labels = jax.tree.leaves(groups(params))
     for name in state.adam.schedules:
         rates = {
             group: schedule._replace(start=jnp.asarray(1e-3 if group == name else 0.0))
             for group, schedule in state.adam.schedules.items()
         }
-        after = take(state._replace(adam=state.adam._replace(schedules=rates))).scene.params
+        after = take_step(state._replace(adam=state.adam._replace(schedules=rates))).scene.params
         moved = {label for label, x, y in zip(labels, leaves, jax.tree.leaves(after), strict=True) if np.any(x != y)}
         assert moved == {name}
 
 
-def test_a_scene_has_no_rates_for_what_it_does_without(dataset):
-    """So that its checkpoints are those of versions before there were any."""
+def test_parts_that_a_scene_lacks_have_no_learning_rate(dataset):
+    """So its checkpoints have the layout of versions without these parts."""
     rates = initial_state(dataset, config_of(**{"model.motion_gate": False})).adam.schedules
     assert rates.keys() == set(RATE_GROUPS) - {"gate", "paths", "lifetimes", "exposures", "curves"}
 
 
-def test_weights_on_sizes_and_the_gate(dataset):
-    """Each counts in the stages and in the unit that it should."""
+def test_the_weights_of_opacity_scale_and_gate_apply_in_the_right_stage_and_unit(dataset):
     config = config_of()
     model = dataclasses.replace(config.model, motion_gate=True, unit="depth")
     bare = dataclasses.replace(config, model=model)
@@ -242,7 +241,7 @@ def test_weights_on_sizes_and_the_gate(dataset):
             np.testing.assert_allclose(added, expected, rtol=1e-6, atol=1e-12, err_msg=name)
 
 
-def test_depth_of_the_scene_counts_by_its_weight(dataset):
+def test_given_depth_adds_its_term_times_its_weight(dataset):
     config = config_of(**{"loss.depth_input": 0.0})
     distances = np.random.default_rng(0).uniform(1, 3, dataset.train.images.shape[:-1]).astype(np.float32)
     state, batch = initial_state(dataset, config), batch_of(dataset.train, [0, 3])
@@ -252,8 +251,8 @@ def test_depth_of_the_scene_counts_by_its_weight(dataset):
     @jax.jit
     def losses():
         def loss(batch, weight):
-            own = overrides.replace(config, {"loss.depth_input": weight})
-            value, (report, _) = objective.objective(state.scene.params, probe, state, batch, own, False, 4096)
+            weighted = overrides.replace(config, {"loss.depth_input": weight})
+            value, (report, _) = objective.objective(state.scene.params, probe, state, batch, weighted, False, 4096)
             return value, report.terms
 
         return loss(batch, 3.0), loss(given, 0.0), loss(given, 3.0)
@@ -265,7 +264,7 @@ def test_depth_of_the_scene_counts_by_its_weight(dataset):
     np.testing.assert_allclose(used - unused, 3 * more["depth_input"], rtol=1e-9)
 
 
-def test_bands_by_the_length_of_the_run(dataset):
+def test_without_sh_warmup_the_sh_degree_follows_the_length_of_the_run(dataset):
     config = dataclasses.replace(config_of(), coarse_steps=40, fine_steps=80, sh_warmup=None)
     config = dataclasses.replace(config, model=dataclasses.replace(config.model, sh_degree=3))
     bands = [int(objective.sh_degree(number, config)) for number in (0, 19, 20, 40, 59, 60, 119)]
@@ -273,7 +272,7 @@ def test_bands_by_the_length_of_the_run(dataset):
 
 
 @pytest.mark.parametrize("bounded", [True, False])
-def test_reflectances_are_held_in_their_range_where_they_are_to_be(dataset, bounded):
+def test_reflectances_stay_in_0_to_1_only_if_bounded(dataset, bounded):
     config = config_of(**{"model.bounded_reflectance": bounded, "optim.reflectance_lr": 0.3})
     state, batch = initial_state(dataset, config), batch_of(dataset.train, [0, 3])
     step = jax.jit(partial(train_step, config=config, moving=False, pair_capacity=4096))

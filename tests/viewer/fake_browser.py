@@ -1,4 +1,4 @@
-"""What viser hands over of a browser, without one."""
+"""A stand-in for a browser as viser presents it."""
 
 import contextlib
 from types import SimpleNamespace
@@ -21,7 +21,7 @@ class Control:
         self._set(value, None)
 
     def move(self, value):
-        """By hand, in the browser."""
+        """Set the value as a person does in the browser."""
         self._set(value, "a browser")
 
     def on_update(self, callback):
@@ -37,7 +37,7 @@ class Control:
 
 
 class Gui:
-    """Controls by their names."""
+    """Controls by name."""
 
     def __init__(self):
         self.controls = {}

@@ -1,4 +1,4 @@
-"""Sizes of pictures."""
+"""The ladder of picture sizes."""
 
 import math
 
@@ -32,7 +32,7 @@ def test_pixels_are_nearly_square(aspect):
 
 
 @given(WINDOWS, st.lists(st.floats(0.001, 2), min_size=4, max_size=4))
-def test_while_moving_the_largest_that_is_fast_enough(window, times):
+def test_while_moving_the_largest_size_that_is_fast_enough_is_drawn(window, times):
     sizes = ladder(window)
     seconds = dict(zip(sizes, times, strict=False))
     size = while_moving(sizes, seconds)
@@ -41,7 +41,7 @@ def test_while_moving_the_largest_that_is_fast_enough(window, times):
 
 
 @given(WINDOWS)
-def test_sharpening_ends_at_the_largest(window):
+def test_sharpening_climbs_to_the_largest_size(window):
     sizes = ladder(window)
     seen = [sizes[0]]
     while size := sharper(sizes, seen[-1]):

@@ -1,4 +1,4 @@
-"""A training that is looked at while it goes on."""
+"""Viewing a training while it runs."""
 
 import contextlib
 
@@ -14,7 +14,7 @@ from l2dgs_jax.viewer.server import Server
 
 
 class Audience:
-    """In the server's place: what it was told to show."""
+    """A stand-in for the server: the steps that it was told to show."""
 
     def __init__(self):
         self.steps, self.watched, self.port = [], True, None
@@ -44,23 +44,23 @@ def clock(monkeypatch):
     return clock
 
 
-def test_states_are_shown_from_the_fine_stage_on_now_and_then_and_to_those_who_look(tmp_path, audience, clock):
-    run, told = finished_run.opened(tmp_path), []
+def test_states_are_shown_from_the_fine_stage_on_at_intervals_while_watched(tmp_path, audience, clock):
+    run, ports = finished_run.opened(tmp_path), []
 
     def step(number):
         state = run.state._replace(step=np.int32(number))
         clock[0] += 0.75 * live.LEAST_INTERVAL
         on_step(Progress(number, jax.tree.map(lambda x: jax.numpy.asarray(x)[None], state), None, 1024))
 
-    with live.live(run.dataset, run.config, "127.0.0.1", 8080, told.append) as on_step:
+    with live.live(run.dataset, run.config, "127.0.0.1", 8080, ports.append) as on_step:
         for number in range(1, run.config.coarse_steps + 1):
             step(number)
-        assert not told
+        assert not ports
         first = run.config.coarse_steps + 1
         for number in range(first, first + 5):
             step(number)
         assert audience.steps == [first, first + 2, first + 4]
-        assert told == [8081]
+        assert ports == [8081]
         audience.watched = False
         step(first + 9)
         step(first + 10)

@@ -1,4 +1,4 @@
-"""A browser's camera and the renderer's."""
+"""Conversion between a browser's camera and the renderer's."""
 
 import numpy as np
 import pytest
@@ -21,32 +21,32 @@ def filmed():
     return Camera(viewmat, K, np.float64(0.4))
 
 
-def browsers(pose):
-    """The rotation that a browser reports of a camera that looks at a point."""
+def rotation_in_browser(pose):
+    """The rotation that a browser reports for a camera that looks at a point."""
     forward = pose.look_at - pose.position
     right = np.cross(forward, pose.up)
     axes = np.stack([right / np.linalg.norm(right), -pose.up, forward / np.linalg.norm(forward)], axis=1)
     return np.roll(Rotation.from_matrix(axes).as_quat(), 1)
 
 
-def seen(camera, size):
-    """Where points of the world appear, in parts of the width and the height."""
+def projected(camera, size):
+    """Where points of the world appear, as fractions of width and height."""
     x, y, z = camera.K @ (camera.viewmat[:3, :3] @ POINTS.T + camera.viewmat[:3, 3:])
     return np.stack([x / z / size[0], y / z / size[1]], axis=-1)
 
 
 @pytest.mark.parametrize("window", [(640, 480), (1280, 480), (300, 480)])
 @pytest.mark.parametrize("size", [FRAME, (320, 96)])
-def test_there_and_back_shows_the_same_and_fills_the_window(filmed, window, size):
+def test_a_camera_converted_there_and_back_shows_the_same_and_fills_the_window(filmed, window, size):
     pose = STAGE.pose(filmed, window)
-    camera = STAGE.camera(browsers(pose), pose.position, pose.field, window, size, 0.4)
+    camera = STAGE.camera(rotation_in_browser(pose), pose.position, pose.field, window, size, 0.4)
     np.testing.assert_allclose(camera.viewmat, filmed.viewmat, atol=1e-6)
     fit = max(window[0] / FRAME[0], window[1] / FRAME[1])  # the frame is enlarged until it fills the window
-    expected = (seen(filmed, FRAME) - 0.5) * fit * np.array(FRAME) / window + 0.5
-    np.testing.assert_allclose(seen(camera, size), expected, atol=1e-5)
+    expected = (projected(filmed, FRAME) - 0.5) * fit * np.array(FRAME) / window + 0.5
+    np.testing.assert_allclose(projected(camera, size), expected, atol=1e-5)
 
 
-def test_the_unit_is_how_far_away_the_scene_is(filmed):
+def test_the_unit_is_the_median_depth_of_the_points(filmed):
     batch = Camera(*(np.asarray(x)[None] for x in filmed))
     depths = (POINTS @ filmed.viewmat[2, :3]) + filmed.viewmat[2, 3]
     assert Stage.of(batch, POINTS, FRAME).unit == pytest.approx(np.median(depths))

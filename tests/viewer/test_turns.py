@@ -26,14 +26,14 @@ def turns(clock):
     return Turns(clock)
 
 
-def test_many_wishes_are_one_picture(turns):
+def test_many_requests_give_one_picture(turns):
     for _ in range(5):
         turns.ask(1)
     assert turns.next() == (Turn(1, sharpen=False), None)
     assert turns.next() == (None, None)
 
 
-def test_a_wish_during_a_drawing_is_another_picture_after_a_while(turns, clock):
+def test_a_request_during_a_drawing_gives_another_picture_after_an_interval(turns, clock):
     turns.ask(1)
     turns.next()
     turns.ask(1)
@@ -48,7 +48,7 @@ def test_whoever_has_waited_longest_is_first(turns, clock):
     for guest in (3, 1, 2):
         turns.ask(guest)
         clock.now += 0.001
-    turns.ask(3)  # asking again costs no place
+    turns.ask(3)  # asking again keeps the place in the queue
     assert [turns.next()[0].guest for _ in range(3)] == [3, 1, 2]
 
 
@@ -67,7 +67,7 @@ def test_pictures_are_sharpened_when_nothing_changes_and_nobody_waits(turns, clo
     assert turns.next()[0] == Turn(1, sharpen=True)
 
 
-def test_a_change_puts_sharpening_off(turns, clock):
+def test_a_change_delays_sharpening(turns, clock):
     turns.ask(1)
     turns.next()
     turns.rest(1)
@@ -79,14 +79,14 @@ def test_a_change_puts_sharpening_off(turns, clock):
     assert turns.next()[0] is None
 
 
-def test_who_has_left_has_no_turn(turns):
+def test_a_guest_who_has_left_has_no_turn(turns):
     turns.ask(1)
     turns.leave(1)
     turns.rest(1)
     assert turns.next() == (None, None)
 
 
-def test_waiting_ends_with_a_wish_or_the_end():
+def test_waiting_ends_with_a_request_or_on_closing():
     turns, taken = Turns(), []
     thread = threading.Thread(target=lambda: [taken.append(turns.take()), taken.append(turns.take())])
     thread.start()

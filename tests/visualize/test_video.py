@@ -1,4 +1,4 @@
-"""Videos: what one program writes another one plays, and so does a browser."""
+"""Videos written by the package, read by other decoders and played by a browser."""
 
 import shutil
 import sys
@@ -33,7 +33,7 @@ def by_pyav(path):
 
 @pytest.fixture(params=[".mp4", ".webm"])
 def decode(request, monkeypatch):
-    """With PyAV or without it; the decoder is not the one that writes."""
+    """Videos are written with PyAV or without it; the decoder is always another program."""
     if request.param == ".webm":
         monkeypatch.setitem(sys.modules, "av", None)
     decoder = by_opencv if request.param == ".mp4" else by_pyav
@@ -46,7 +46,7 @@ def decode(request, monkeypatch):
 
 
 def moving_ramp(count, height, width):
-    """Smooth colours, because codecs blur them, all of them different, and another picture every time."""
+    """Smooth colours, because codecs blur; all pixels differ, and all pictures."""
     x, y = np.meshgrid(np.linspace(0, 1, width), np.linspace(0, 1, height))
     return [np.rint(255 * np.stack([x, y, np.full_like(x, i / count)], -1)).astype(np.uint8) for i in range(count)]
 
@@ -60,7 +60,7 @@ def write(stem, frames, fps=24):
 
 
 @pytest.mark.parametrize(("height", "width", "fps"), [(96, 128, 24), (75, 101, 30), (64, 64, 12.5)])
-def test_another_decoder_sees_every_frame_in_its_colours(tmp_path, decode, height, width, fps):
+def test_another_decoder_reads_every_frame_in_its_colours(tmp_path, decode, height, width, fps):
     pictures = moving_ramp(20, height, width)
     frames, rate = decode(write(tmp_path / "take.1", pictures, fps))
     assert frames.shape == (20, height + height % 2, width + width % 2, 3)
@@ -96,7 +96,7 @@ def test_an_interrupted_video_leaves_the_old_one(tmp_path, decode):
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_frames_that_opencv_loses_are_a_clear_error(tmp_path, monkeypatch):
+def test_frames_that_opencv_loses_are_reported(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "av", None)
     first, second = moving_ramp(2, 64, 64)
     with pytest.raises(UserError, match=r"video\.webm: cannot be written \(frames are missing"):
@@ -104,7 +104,7 @@ def test_frames_that_opencv_loses_are_a_clear_error(tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
-def test_opencv_without_the_codec_is_a_clear_error(tmp_path, monkeypatch):
+def test_opencv_without_the_codec_is_reported(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "av", None)
     monkeypatch.setattr(cv2, "VideoWriter_fourcc", lambda *code: 0)
     with pytest.raises(UserError, match=r"video\.webm: cannot be written \(this OpenCV lacks VP8: pip install av\)"):
@@ -134,7 +134,7 @@ def test_the_video_of_a_run_moves(tmp_path, tmp_path_factory):
 
 @pytest.mark.slow
 @pytest.mark.skipif(not shutil.which("chromium"), reason="needs chromium")
-def test_a_browser_plays_it_to_the_end_in_its_colours(tmp_path, decode):
+def test_a_browser_plays_a_video_to_the_end_in_its_colours(tmp_path, decode):
     colour = [200, 60, 30]
     path = write(tmp_path / "video", [np.full((64, 96, 3), colour, np.uint8)] * 12)
     word, *numbers = browser.played(path, tmp_path / "profile")

@@ -1,4 +1,4 @@
-"""Contact sheet, and the files that pictures are written to."""
+"""The contact sheet, and writing pictures to files."""
 
 import dataclasses
 
@@ -71,7 +71,7 @@ def test_contact_sheet_shows_every_part_of_the_render(run):
         assert sheet[:STRIP_HEIGHT, x : x + cell_width].max() > 200
 
 
-def test_an_exponent_that_is_one_number_has_one_colour(run):
+def test_an_exponent_that_is_constant_has_one_colour(run):
     output = run.renderer()(select_camera(run.dataset.test.cameras, 0))
     rounded = 1.01 + 1e-6 * np.random.default_rng(0).normal(size=output.images.attenuation.shape)
     output = output._replace(images=output.images._replace(attenuation=rounded))
@@ -107,7 +107,7 @@ def test_written_images_read_back_exactly(tmp_path, shape, kind):
     assert [p.name for p in tmp_path.iterdir()] == ["image.png"]
 
 
-def test_files_that_cannot_be_written_are_clear_errors(tmp_path):
+def test_files_that_cannot_be_written_are_reported(tmp_path):
     image = np.zeros((4, 4, 3), np.uint8)
     with pytest.raises(UserError, match=r"missing/image\.png.*expected an existing folder .*missing"):
         images.write_image(tmp_path / "missing" / "image.png", image)
@@ -123,7 +123,7 @@ def test_bytes_round_and_clip():
     np.testing.assert_array_equal(images.to_bytes(values), [0, 0, 0, 1, 128, 255, 255])
 
 
-def test_viridis_brightens_with_the_value_and_stands_a_constant():
+def test_viridis_brightens_with_the_value_and_accepts_a_constant():
     colours = viridis(np.linspace(2, 3, 64).reshape(1, -1), 2.0, 3.0)
     luminance = colours[0] @ [0.2126, 0.7152, 0.0722]
     assert (np.diff(luminance) > 0).all()
