@@ -9,7 +9,7 @@ import tyro
 
 from l2dgs_jax.config import Layout
 from l2dgs_jax.data import load_dataset
-from l2dgs_jax.data.images import write_image
+from l2dgs_jax.data.images import SUFFIXES, write_image
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.preprocess.motion_masks import as_taken, compute_masks, preview, write_masks
 from l2dgs_jax.runtime import command_line
@@ -41,6 +41,8 @@ class Masks:
 def main(arguments: Sequence[str]) -> None:
     """Write the masks of a scene as the command line says."""
     options = command_line.parse(Masks, arguments, "masks")
+    if options.scene == Path("demo") and not options.scene.exists():
+        raise UserError("demo: this clip has no folder to write masks to; expected a scene's folder")
     folder = options.scene / "mask"
     if folder.exists() and not folder.is_dir():
         raise UserError(f"{folder}: is a file; expected a folder, or nothing, to write masks to")
@@ -51,6 +53,8 @@ def main(arguments: Sequence[str]) -> None:
         raise UserError(f"{options.scene}: cannot be written; expected a writable folder to put masks in")
     if options.preview and not options.preview.parent.is_dir():
         raise UserError(f"--preview {options.preview}: cannot be written; expected a file in an existing folder")
+    if options.preview and options.preview.suffix.lower() not in SUFFIXES:
+        raise UserError(f"--preview {options.preview}: not a picture's suffix; expected one of {', '.join(SUFFIXES)}")
     for note in dataset.notes:
         print(f"note: {note}")
 

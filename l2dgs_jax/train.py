@@ -45,10 +45,10 @@ class Train:
 
     Attributes:
         scene: folder of the scene, or "demo" for the clip that comes with the package.
-        preset: settings to start from, which the options below override one by one; the defaults shown here are the
-            preset's. Number of steps: demo 400, fast 600, default 1200 (about ten minutes on one core for frames of
-            200x112, longer for more pixels or points), best 5000, authors 17000, paper 23000; 1200 each for the
-            baselines 4dgs, enhance-4dgs, curve-4dgs and static.
+        preset: settings that a new run starts from, which the options below override one by one; the defaults shown
+            here are the preset's. Number of steps: demo 400, fast 600, default 1200 (about ten minutes on one core for
+            frames of 200x112, longer for more pixels or points), best 5000, authors 17000, paper 23000; 1200 each for
+            the baselines 4dgs, enhance-4dgs, curve-4dgs and static.
         output: run folder; a new one under runs/ if not given.
         resume: continue the run in the output folder from its last checkpoint.
         devices: number of devices to spread the views of a step over; every CPU core is one. If not given, as many as
@@ -107,7 +107,9 @@ def _train(options: Train) -> None:
             start = standing(folder, dataset, config) if options.resume else Checkpoint(initial_state(dataset, config))
         distributed.barrier("everything is read")
         if first:
-            if not options.resume:
+            if options.resume:
+                runs.follow_scene(folder, options.scene)
+            else:
                 with new_folder(folder) as place:
                     runs.write_settings(place, options.scene, config)
                 stack.enter_context(locked(folder))
@@ -206,9 +208,14 @@ def _parse(arguments: Sequence[str]) -> Train:
         _show_help(arguments)
     first = command_line.parse(Train, arguments, "train")
     if first.scene != "demo":
-        first = dataclasses.replace(first, scene=str(Path(first.scene).absolute()))
+        place = Path(first.scene).absolute()
+        # The run folder is named after the scene's, and ".." is no name.
+        first = dataclasses.replace(first, scene=str(place.resolve() if place.name == ".." else place))
     folder = first.output or _run_folder(first.scene, first.resume)
     if first.resume:
+        if first.preset:
+            raise UserError(f"--preset {first.preset}: expected none with --resume, which keeps the run's settings")
+        runs.check_scene(folder, first.scene)
         base = runs.read_settings(folder)[1]
     else:
         base = PRESETS[_preset(first)]
@@ -217,7 +224,7 @@ def _parse(arguments: Sequence[str]) -> Train:
                 f"{folder}: already holds another run or files; expected a new folder for --output, or --resume"
             )
     options = command_line.parse(Train, arguments, "train", Train(scene=first.scene, config=base))
-    options.config.check_counts()
+    options.config.check()
     return dataclasses.replace(options, scene=first.scene, output=folder)
 
 

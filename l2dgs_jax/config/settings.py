@@ -311,21 +311,47 @@ class Config:
         """The stage that a step belongs to; steps are numbered from 1."""
         return "coarse" if step <= self.coarse_steps else "fine"
 
-    def check_counts(self) -> None:
-        """Check the numbers of steps, of views per step, and of checkpoints.
+    def check(self) -> None:
+        """Check the ranges of numbers; not when settings are made, as the numbers may then be placeholders or traced.
 
         Raises:
-            UserError: a number of steps is negative or both are zero, or one of the other numbers is below 1.
+            UserError: a number is out of range.
         """
-        for name, count in (
-            ("--batch-size", self.batch_size),
-            ("--checkpoint-every", self.checkpoint_every),
-            ("--keep-checkpoints", self.keep_checkpoints),
+        model, window = self.model, self.loss.exposure_window
+        for name, count, least in (
+            ("--batch-size", self.batch_size, 1),
+            ("--checkpoint-every", self.checkpoint_every, 1),
+            ("--keep-checkpoints", self.keep_checkpoints, 1),
+            ("--downscale", self.downscale, 1),
+            ("--density.interval", self.density.interval, 1),
+            ("--loss.exposure-window", window, 1),
+            ("--model.plane-size", model.plane_size, 2),
+            ("--model.time-size", model.time_size, 2),
         ):
-            if count < 1:
-                raise UserError(f"{name} {count}: expected at least 1")
+            if count is not None and count < least:
+                raise UserError(f"{name} {count}: expected at least {least}")
+        for name, value, fits, expected in (
+            ("--seed", self.seed, 0 <= self.seed < 2**31, "a whole number from 0 below 2^31"),
+            ("--inbetweens", self.inbetweens, 0 <= self.inbetweens < 1, "at least 0 and less than 1"),
+            ("--drop", self.drop, 0 <= self.drop < 1, "at least 0 and less than 1"),
+            ("--model.box-rim", model.box_rim, 0 <= model.box_rim < 1, "at least 0 and less than 1"),
+            ("--model.box-points", model.box_points, 0 < model.box_points <= 1, "more than 0 and at most 1"),
+            ("--model.initial-opacity", model.initial_opacity, 0 < model.initial_opacity < 1, "between 0 and 1"),
+            ("--model.sh-degree", model.sh_degree, 0 <= model.sh_degree <= 3, "a whole number from 0 to 3"),
+            ("--model.tone", model.tone, _is_exponent(model.tone), "an exponent between 1 and 10, or a name"),
+        ):
+            if not fits:
+                raise UserError(f"{name} {value}: expected {expected}")
+        for value in model.initial_exponents or ():
+            if not _is_exponent(value):
+                raise UserError(f"--model.initial-exponents {value}: expected exponents between 1 and 10")
         if self.steps < 1 or min(self.coarse_steps, self.fine_steps) < 0:
             raise UserError("--coarse-steps and --fine-steps: expected no negative number and at least one step in all")
+
+
+def _is_exponent(value: Any) -> bool:
+    """Whether BAFE-Net can give an exponent (Eq. 9), or it is left to be determined."""
+    return isinstance(value, str) or 1 < value < 10
 
 
 # Settings of how a run is carried out, not of what it computes: they may change when it is resumed.

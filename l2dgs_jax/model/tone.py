@@ -80,7 +80,8 @@ def lit_level(
     brightest = np.concatenate([image.max(-1)[counted] for image, counted in _sampled_frames(images, valid)])
     known = np.array([dark_level, MID_GREY, np.quantile(brightest, HIGHLIGHT_QUANTILE), MAX_HIGHLIGHTS])
     dark, grey, highlights, limit = srgb_to_linear(known) if of_light else known
-    level = np.asarray(grey * np.clip(limit / (highlights * grey / dark), MIN_LEVEL_FACTOR, 1.0))
+    brightened = max(highlights * grey / dark, 1e-6)  # highlights are 0 where hardly any pixel is not black
+    level = np.asarray(grey * np.clip(limit / brightened, MIN_LEVEL_FACTOR, 1.0))
     return float(linear_to_srgb(level) if of_light else level)
 
 

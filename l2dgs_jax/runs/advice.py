@@ -2,6 +2,7 @@
 
 import math
 
+from l2dgs_jax.cameras import camera_extent, median_depth
 from l2dgs_jax.config import Config
 from l2dgs_jax.data import Dataset
 
@@ -9,10 +10,17 @@ USUAL_PIXELS = 90_000  # of a frame: 400x225
 MANY_PIXELS = 250_000
 FEW_POINTS = 500
 FEW_FRAMES = 8
+STILL = 0.01  # extent of the camera's path over median depth; that of a hand-held camera is about 0.25
 
 
 def misfit(dataset: Dataset, config: Config) -> str | None:
     """One sentence on the costliest mismatch between scene and settings; None if there is none."""
+    cameras = dataset.train.cameras
+    if config.model.unit == "world" and camera_extent(cameras) < STILL * median_depth(cameras, dataset.points):
+        return (
+            "the camera hardly moves, and with --model.unit world little is learned then, as learning rates scale with "
+            "the extent of its path; --model.unit depth scales them with the depth of the scene"
+        )
     pixels = dataset.width * dataset.height
     if pixels > MANY_PIXELS:
         factor = math.ceil(math.sqrt(pixels / MANY_PIXELS))

@@ -155,10 +155,7 @@ def load(path: Path, config: Config, num_frames: int) -> Checkpoint:
                 raise UserError(
                     f"{path}: of version {version}; expected at most {VERSION}: a newer l2dgs_jax has written it"
                 )
-            written = to_dict(from_dict(header["config"]))  # completed by the defaults of settings added since
-            difference = _first_difference(written, to_dict(config))
-            if difference:
-                raise UserError(f"{path}: written with other settings ({difference}); expected those of this run")
+            check_settings(path, from_dict(header["config"]), config)
             misfit = next((name for name, leaf in expected.items() if not _fits(archive, name, leaf)), None)
             if misfit:
                 raise UserError(
@@ -173,6 +170,22 @@ def load(path: Path, config: Config, num_frames: int) -> Checkpoint:
         raise
     except DAMAGE_ERRORS:
         raise DamagedError(f"{path}: truncated or not a checkpoint; expected a whole file that train wrote") from None
+
+
+def check_settings(path: Path, written: Config, config: Config) -> None:
+    """Check that a file was written with the settings of a training, except those in `EXECUTION`.
+
+    Args:
+        path: the file.
+        written: its settings, completed by the defaults of settings added since.
+        config: the settings of the training.
+
+    Raises:
+        UserError: they differ.
+    """
+    difference = _first_difference(to_dict(written), to_dict(config))
+    if difference:
+        raise UserError(f"{path}: written with other settings ({difference}); expected those of this run")
 
 
 def _make_way(path: Path, keep: int) -> None:

@@ -34,11 +34,11 @@ def fit(
 
     Raises:
         DivergedError: the loss or a gradient is not finite.
-        UserError: a number of steps, views or checkpoints is invalid, or all training frames are black.
+        UserError: a setting is out of range, or the data set cannot be trained on.
         ValueError: the views cannot be shared evenly by so many devices, there are not that many, or a process would be
             left without any.
     """
-    config.check_counts()
+    config.check()
     devices.one_per_core()
     if device_count is None:
         device_count = devices.shares(config.batch_size)

@@ -48,6 +48,34 @@ def read_settings(folder: Path) -> tuple[str, Config]:
         raise UserError(f"{path}: unreadable settings ({error}); expected those that train wrote") from None
 
 
+def check_scene(folder: Path, scene: str) -> None:
+    """Check that a run can continue on a scene: it is the run's own, or where that may have been moved.
+
+    Args:
+        folder: of the run.
+        scene: absolute path of the scene's folder, or "demo".
+
+    Raises:
+        UserError: the run's own scene is another one that still exists, or one of the two is the demo.
+    """
+    own, _ = read_settings(folder)
+    if scene == own:
+        return
+    if "demo" in (own, scene) or (Path(own).exists() and Path(scene).exists() and not Path(scene).samefile(own)):
+        raise UserError(f"{scene}: not the scene of {folder}; expected {own}, or a new folder for --output")
+
+
+def follow_scene(folder: Path, scene: str) -> None:
+    """Record where the scene of a run has been moved, if its folder no longer exists.
+
+    Raises:
+        UserError: the settings cannot be written.
+    """
+    own, config = read_settings(folder)
+    if own != "demo" and not Path(own).exists():
+        write_settings(folder, scene, config)
+
+
 def save_run(run: Run, folder: str | Path) -> Run:
     """Write a run's settings and state to a new folder, which the commands and `open_run` can open.
 
@@ -101,10 +129,12 @@ def last_checkpoint(folder: Path, dataset: Dataset, config: Config, skip: int = 
         skip: see `checkpoints.load_last`.
 
     Raises:
-        UserError: all checkpoints are damaged, or were written with other settings.
+        UserError: all checkpoints are damaged, or they or the folder's settings are other ones.
     """
     path = folder / CHECKPOINT
     if not checkpoints.kept(path):
+        if (folder / SETTINGS).exists():
+            checkpoints.check_settings(folder / SETTINGS, read_settings(folder)[1], config)
         return Checkpoint(initial_state(dataset, config))
     return checkpoints.load_last(path, config, len(dataset.train.names), skip)
 

@@ -75,7 +75,7 @@ def read(path: Path, scenes: Sequence[str] = ()) -> Spec:
         varied = {"seed": seed, **point, **variant}
         try:
             config = overrides.replace(PRESETS[own_preset or preset], settings | varied)
-            config.check_counts()
+            config.check()
         except UserError as error:
             raise UserError(f"{path}: {error}") from None
         parts = [f"{len(plans):02d}", Path(scene).name, f"seed{seed}", *_labels(point), *([label] if label else [])]

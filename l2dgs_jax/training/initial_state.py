@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from l2dgs_jax.cameras.geometry import median_depth
 from l2dgs_jax.config import Config, overrides
 from l2dgs_jax.data.dataset import Dataset, Split
 from l2dgs_jax.errors import UserError
@@ -44,11 +45,20 @@ def resolve(config: Config, dataset: Dataset) -> Config:
     """The settings with what they leave to the data ("auto") determined from points and training frames.
 
     Raises:
-        UserError: the frames are black.
+        UserError: the frames show nothing, or the points are behind all cameras.
     """
     split = dataset.train
-    if split.mean_level == 0:
-        raise UserError(f"{dataset.name}: all its training frames are black; expected frames that show something")
+    counted = split.valid is None or any(frame.any() for frame in split.valid)
+    if not counted or split.mean_level == 0:
+        raise UserError(
+            f"{dataset.name}: all its training frames are black or transparent; expected frames that show something"
+        )
+    try:
+        median_depth(split.cameras, dataset.points)
+    except ValueError as error:
+        raise UserError(
+            f"{dataset.name}: {error}; expected poses that face its points: they may be in another axis convention"
+        ) from None
     if config.density.max_gaussians == "auto":
         config = overrides.replace(config, {"density.max_gaussians": _max_gaussians(split)})
     if config.model.exposure == "auto":

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -269,6 +270,44 @@ def test_resuming_with_other_settings_is_refused(refuses, scene, finished):
     )
 
 
+def run_without_checkpoint(folder, scene):
+    runs.write_settings(folder, str(scene), resolve(tiny(), load_dataset(scene)))
+    return folder
+
+
+def test_resuming_with_other_settings_before_the_first_checkpoint_is_refused(refuses, scene, tmp_path):
+    folder = run_without_checkpoint(tmp_path / "run", scene)
+    named = ["config.json", "model.hidden was 8, is 16"]
+    refuses(scene, "--output", folder, "--resume", "--model.hidden=16", "--keep-checkpoints=3", naming=named)
+
+
+def test_resuming_with_a_preset_is_refused(refuses, scene, tmp_path):
+    folder = run_without_checkpoint(tmp_path / "run", scene)
+    refuses(scene, "--output", folder, "--resume", "--preset=fast", naming=["--preset fast", "--resume"])
+
+
+def test_resuming_on_another_scene_is_refused(refuses, scene, damaged, tmp_path):
+    folder = run_without_checkpoint(tmp_path / "run", scene)
+    for other in (damaged, "demo"):
+        refuses(other, "--output", folder, "--resume", naming=[str(other), str(folder), str(scene)])
+    (tmp_path / "link").symlink_to(scene)
+    assert train._parse([str(tmp_path / "link"), "--output", str(folder), "--resume"]).output == folder
+
+
+def test_a_run_resumes_on_a_scene_that_has_been_moved(damaged, tmp_path, monkeypatch):
+    folder = run_without_checkpoint(tmp_path / "run", damaged)
+    before = runs.read_settings(folder)[1]
+    damaged.rename(tmp_path / "moved")
+
+    def stop(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(train, "_record", stop)
+    with pytest.raises(KeyboardInterrupt):
+        train.main([str(tmp_path / "moved"), "--output", str(folder), "--resume", "--keep-checkpoints=3"])
+    assert runs.read_settings(folder) == (str(tmp_path / "moved"), before)
+
+
 def test_resuming_from_a_truncated_checkpoint_is_refused(refuses, scene, finished, tmp_path):
     (tmp_path / runs.SETTINGS).write_bytes((finished[0] / runs.SETTINGS).read_bytes())
     (tmp_path / runs.CHECKPOINT).write_bytes((finished[0] / runs.CHECKPOINT).read_bytes()[:1000])
@@ -288,8 +327,7 @@ def test_what_cannot_start_leaves_no_folder(refuses, scene, tmp_path, monkeypatc
     refuses(scene, "--model.moving-share=0", "--output", tmp_path / "run", naming=["--model.moving-share 0"])
     tone = ("--model.domain", "light", "--model.tone", "1.2")
     refuses(scene, *tone, "--output", tmp_path / "run", naming=["--model.tone 1.2", "--model.domain values"])
-    with pytest.raises(ValueError, match="at least 2 cells"):
-        train.main([str(scene), "--model.plane-size=1", "--output", str(tmp_path / "run")])
+    refuses(scene, "--model.plane-size=1", "--output", tmp_path / "run", naming=["--model.plane-size 1", "at least 2"])
     assert not (tmp_path / "run").exists()
 
 
@@ -299,6 +337,13 @@ def test_options_of_the_run_are_read_together_with_a_preset(scene, tmp_path):
     assert (options.quiet, options.json, options.report, options.tensorboard) == (True, True, False, True)
     assert (options.devices, options.config.fine_steps, options.config.coarse_steps) == (1, 7, 100)
     assert not options.resume
+
+
+def test_a_run_on_the_folder_above_is_named_after_it(scene, monkeypatch):
+    monkeypatch.chdir(scene / "rgb")
+    options = train._parse([".."])
+    assert options.output == Path("runs") / scene.name
+    assert options.scene == str(scene.resolve())
 
 
 def shown_default(capsys, arguments, option):

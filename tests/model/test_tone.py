@@ -118,6 +118,13 @@ def test_the_lit_level_is_lowered_for_highlights():
     assert np.quantile(undone.max(-1), 0.98) == pytest.approx(0.9, abs=0.01)
 
 
+@pytest.mark.parametrize("of_light", [True, False])
+def test_frames_that_are_black_but_for_a_few_pixels_are_lit_to_mid_grey(of_light):
+    frames = np.zeros((3, 96, 128, 3))
+    frames[:, :4, :4] = 0.2
+    assert lit(frames, of_light) == pytest.approx(0.46)
+
+
 def test_the_lit_level_is_lowered_by_at_most_one_stop():
     frames = 0.1 * photographs(contrast=0.4)
     frames[:, :24, :24] = 1.0

@@ -40,5 +40,17 @@ def test_few_points_give_no_warning_if_gaussians_are_added():
     assert misfit(dataset_of(points=20), tiny(density=GROWING)) is None
 
 
+def test_a_camera_that_stands_still_needs_another_unit_than_that_of_its_path():
+    moving, config = make_dataset(), tiny("paper")
+    train = moving.train
+    viewmat = train.cameras.viewmat[:1].repeat(len(train.names), 0)
+    still = dataclasses.replace(
+        moving, train=dataclasses.replace(train, cameras=train.cameras._replace(viewmat=viewmat))
+    )
+    assert "--model.unit depth" in misfit(still, config)
+    assert "--model.unit" not in misfit(moving, config)
+    assert "--model.unit" not in misfit(still, tiny())
+
+
 def test_the_suggested_downscale_multiplies_the_one_in_use():
     assert "--downscale 4" in misfit(dataset_of(size=(960, 540)), tiny(density=FIXED, downscale=2))

@@ -60,6 +60,17 @@ def test_black_frames_are_refused(dataset):
         resolve(tiny(), dataclasses.replace(dataset, train=black))
 
 
+def test_frames_without_a_valid_pixel_are_refused(dataset):
+    transparent = dataclasses.replace(dataset.train, valid=np.zeros(dataset.train.images.shape[:3], bool))
+    with pytest.raises(UserError, match="tiny: all its training frames are black or transparent; expected"):
+        resolve(tiny(), dataclasses.replace(dataset, train=transparent))
+
+
+def test_points_behind_all_cameras_are_refused(dataset):
+    with pytest.raises(UserError, match=r"tiny: no point lies in front of a camera; expected .* axis convention"):
+        resolve(tiny(), dataclasses.replace(dataset, points=-dataset.points))
+
+
 @pytest.mark.parametrize(
     ("views", "side", "found"),
     [(3, 50, 1_500), (32, 50, 2_000), (80, 50, 2_500), (3, 1_000, 360_000)],
