@@ -12,6 +12,7 @@ import pytest
 from clips import FOCAL, HEIGHT, WIDTH, clip
 from tiny_training import FRAMES, assert_equal_states, finish, make_dataset, state_of, tiny
 
+from l2dgs_jax.config import overrides
 from l2dgs_jax.data import Split
 from l2dgs_jax.model.deformation import path_weights
 from l2dgs_jax.model.initialisation import Seeds, path_knots
@@ -144,6 +145,15 @@ def test_a_training_starts_with_the_seeds_after_the_points(tracked):
     assert first[0] < second[0]
     assert first[2] > second[2]
     assert np.isinf(scene.params.gaussians.lifetimes[:points]).all()
+
+
+def test_the_largest_number_of_gaussians_limits_the_seeds(tracked, monkeypatch):
+    asked = []
+    module = sys.modules["l2dgs_jax.training.initial_state"]
+    monkeypatch.setattr(module, "find_seeds", lambda *_, most: asked.append(most) or TWO_SEEDS)
+    for limit in (5, 10**6):
+        initial_state(make_dataset(), overrides.replace(tracked[0], {"density.max_gaussians": limit}))
+    assert asked[0] == 5 < asked[1] < 10**6  # the second by the number of pixels
 
 
 @pytest.mark.slow
