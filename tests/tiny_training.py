@@ -61,6 +61,13 @@ def batch_of(split, frames):
     return jax.tree.map(lambda x: jnp.asarray(x, float) if x.dtype.kind == "f" else jnp.asarray(x), batch)
 
 
+def uneven(params, seed=1):
+    """The same parameters with a motion field that moves every Gaussian in its own way."""
+    rng = np.random.default_rng(seed)
+    disturbed = lambda tree: jax.tree.map(lambda x: x + jnp.asarray(rng.normal(0, 0.3, x.shape), x.dtype), tree)
+    return params._replace(hexplane=disturbed(params.hexplane), heads=disturbed(params.heads))
+
+
 def report(loss=0.0):
     """The report of a step that is not computed."""
     zero, no = jnp.zeros(1), jnp.zeros(1, bool)

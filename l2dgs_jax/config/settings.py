@@ -198,6 +198,8 @@ class LossConfig:
     opacity: Number = 0.0  # weight of the mean opacity
     scale: Number = 0.0  # weight of the mean scale, in the unit of lengths
     gate: Number = 0.0  # weight of the mean motion gate; fine stage only
+    # weight of how much neighbours change their distances over time (training/rigidity.py); fine stage only
+    rigidity: Number = 0.0
     # with tone curves: weight of their distance from curves that give well-lit images a flat histogram
     equalisation: Number = 0.0
     # with tone curves: weight of their distance from power laws

@@ -11,6 +11,7 @@ from l2dgs_jax.model.rendering import render
 from l2dgs_jax.runtime import devices
 from l2dgs_jax.training import losses
 from l2dgs_jax.training.given_depth import depth_disagreement
+from l2dgs_jax.training.rigidity import rigidity
 from l2dgs_jax.training.state import Batch, StepReport, TrainState, randomness
 from l2dgs_jax.types import Scene, SceneParams, ToneCurves
 
@@ -56,8 +57,9 @@ def objective(
         The loss, and (the report, the Gaussians' radii in every view, pixels).
     """
     height, width = batch.images.shape[1:3]
+    scene = state.scene._replace(params=params)
     output = render(
-        state.scene._replace(params=params),
+        scene,
         batch.cameras,
         config.model,
         width,
@@ -80,10 +82,12 @@ def objective(
     target, counted = targets(batch, images.lowlight)
     measured = output._replace(images=images, depth=output.depth / length_unit(state.scene.extent, config.model))
     loss, terms = losses.total(measured, target, cfg, eta, exponent_target(config))
+    others = size_terms(scene, config, moving) | curve_terms(params.curves, batch, cfg)
     if moving:
         smoothness, time_smoothness, time_l1 = hexplane.regularisers(params.hexplane)
         loss += cfg.plane_smoothness * smoothness + cfg.time_smoothness * time_smoothness + cfg.time_l1 * time_l1
-    others = size_terms(state.scene._replace(params=params), config, moving) | curve_terms(params.curves, batch, cfg)
+        key = jax.random.fold_in(randomness(state, config), 5)
+        others["rigidity"] = (cfg.rigidity, lambda: rigidity(scene, config.model, key))
     if batch.depths is not None:
         depths = batch.depths
         others["depth_input"] = (cfg.depth_input, lambda: depth_disagreement(output.depth, output.alpha, depths))

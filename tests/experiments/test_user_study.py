@@ -84,7 +84,7 @@ def test_answers_to_something_else_are_refused(tmp_path, given, naming):
 
 def test_answers_of_one_participant_in_two_files_are_refused(tmp_path):
     path, content = person(tmp_path, "one", answer("Scene 1", 0, "A"))
-    with pytest.raises(UserError, match="one"):
+    with pytest.raises(UserError, match="'one' has given several"):
         aggregate(KEY, {path: content, tmp_path / "again.json": content})
 
 

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from tiny_training import batch_of, make_dataset, tiny
+from tiny_training import batch_of, make_dataset, tiny, uneven
 
 from l2dgs_jax.config import DensityConfig, overrides
 from l2dgs_jax.config.settings import RATE_GROUPS
@@ -239,6 +239,27 @@ def test_the_weights_of_opacity_scale_and_gate_apply_in_the_right_stage_and_unit
             expected = 0 if name == "gate" and not moving else 2 * size
             added = loss(dict.fromkeys(sizes, 0.0) | {name: 2.0}, moving) - plain
             np.testing.assert_allclose(added, expected, rtol=1e-6, atol=1e-12, err_msg=name)
+
+
+def test_rigidity_adds_its_term_times_its_weight_in_the_fine_stage(dataset):
+    config = config_of(**{"loss.rigidity": 0.0})
+    state, batch = initial_state(dataset, config), batch_of(dataset.train, [0, 3])
+    params, probe = uneven(state.scene.params), jnp.zeros((2, len(state.scene.alive), 2))
+    near = params.gaussians._replace(means=0.05 * params.gaussians.means)  # otherwise there are no neighbours
+    params = params._replace(gaussians=near)
+
+    @partial(jax.jit, static_argnums=(0, 1))
+    def loss(weight, moving):
+        weighted = overrides.replace(config, {"loss.rigidity": weight})
+        value, (report, _) = objective.objective(params, probe, state, batch, weighted, moving, 4096)
+        return value, report.terms
+
+    (coarse, _), (coarse_too, _) = loss(0.0, False), loss(3.0, False)
+    assert coarse == coarse_too
+    (without, terms), (used, more) = loss(0.0, True), loss(3.0, True)
+    assert more.keys() - terms.keys() == {"rigidity"}
+    assert more["rigidity"] > 1e-4
+    np.testing.assert_allclose(used - without, 3 * more["rigidity"], rtol=1e-9)
 
 
 def test_given_depth_adds_its_term_times_its_weight(dataset):
