@@ -14,27 +14,29 @@ DRAWN = 1024  # Gaussians that are looked at in one step
 NEIGHBOURS = 4  # of each
 RADIUS = 0.05  # distance at which the weight of a neighbour has fallen to 1/e, in units of length
 SPANS = (0.02, 0.1)  # shortest and longest time between the two instants, as shares of the clip
-SOFTNESS = 1e-4  # distances below it, in units of length, count as equal: their gradients would have no limit at 0
+SOFTNESS = 1e-4  # in units of length: the gradient of a shorter distance is small, where that of 0 would be undefined
+PSEUDO_COUNT = 1  # weight of no change in the mean, so that a few faint pairs do not count as much as many
 
 
 def rigidity(scene: Scene, cfg: ModelConfig, key: PRNGKeyArray) -> Float[Array, ""]:
     """Mean change of the distances between neighbours from one random instant to another, in units of length.
 
-    Local rigidity as in Dynamic 3D Gaussians (arXiv 2308.09713), on a random sample, of which Gaussians with wide open
-    motion gates and those on paths are the larger part. Gradients flow to what moves the Gaussians.
+    After the local isometry of Dynamic 3D Gaussians (arXiv 2308.09713), but between two near instants, and for a random
+    sample of the Gaussians. They are drawn in proportion to their motion gates, those on paths as if theirs were open.
+    Gradients flow to the centres, the gates, the paths and the motion field.
 
     Args:
-        scene: the scene; a scene without motion gates is sampled evenly.
-        cfg: shape of the scene.
+        scene: the scene; one without motion gates is sampled evenly.
+        cfg: shape of the scene. All Gaussians that are drawn move, whatever `moving_share`.
         key: of the sample and the instants.
     """
     for_sample, for_first, for_span = jax.random.split(key, 3)
     gaussians, dtype = scene.params.gaussians, scene.params.gaussians.means.dtype
-    odds = jnp.where(scene.alive, 0 if gaussians.gate is None else jax.nn.log_sigmoid(gaussians.gate), -jnp.inf)
+    log_weights = jnp.where(scene.alive, 0 if gaussians.gate is None else jax.nn.log_sigmoid(gaussians.gate), -jnp.inf)
     if gaussians.lifetimes is not None:
-        odds = jnp.where(scene.alive & jnp.isfinite(gaussians.lifetimes).all(-1), 0, odds)
+        log_weights = jnp.where(scene.alive & jnp.isfinite(gaussians.lifetimes).all(-1), 0, log_weights)
     # The highest sums are draws without replacement (arXiv 1903.06059).
-    scores = jax.lax.stop_gradient(odds) + jax.random.gumbel(for_sample, odds.shape, dtype)
+    scores = jax.lax.stop_gradient(log_weights) + jax.random.gumbel(for_sample, log_weights.shape, dtype)
     rows = jax.lax.top_k(scores, min(DRAWN, len(scores)))[1]
     drawn = jax.tree.map(lambda values: values[rows], gaussians)
 
@@ -45,7 +47,7 @@ def rigidity(scene: Scene, cfg: ModelConfig, key: PRNGKeyArray) -> Float[Array, 
     moved = deform(
         scene._replace(params=scene.params._replace(gaussians=drawn), alive=scene.alive[rows]),
         Camera(anywhere(4), anywhere(3), instants),  # motion does not depend on where the camera is
-        dataclasses.replace(cfg, moving_share=1.0),  # all that are drawn move
+        dataclasses.replace(cfg, moving_share=1.0),
         moving=True,
         sh_degree_active=0,
     )
@@ -55,12 +57,13 @@ def rigidity(scene: Scene, cfg: ModelConfig, key: PRNGKeyArray) -> Float[Array, 
 def change_of_distances(means: Float[Array, "2 N 3"], opacities: Float[Array, "2 N"]) -> Float[Array, ""]:
     """Mean |change of distance| to the nearest neighbours between two instants; 0 if all move as one rigid body.
 
-    Neighbours are those of the first instant. They count the more the nearer they are and the more opaque both are at
-    both instants. Gradients flow to `means`.
+    Neighbours are those of the first instant. A pair counts the more the nearer the two are, and the more opaque they
+    are at both instants. Gradients flow to `means`.
     """
     near, opacity = jax.lax.stop_gradient((means[0], opacities[0] * opacities[1]))
-    squares = sum(jnp.square(axis[:, None] - axis[None]) for axis in near.T)  # an axis of length 3 is slow on a CPU
+    # Axis by axis, because sums along an axis of length 3 are slow on a CPU.
+    squares = sum(jnp.square(axis[:, None] - axis[None]) for axis in near.T)
     nearest, others = jax.lax.top_k(-squares - jnp.diag(jnp.full(len(near), jnp.inf)), min(NEIGHBOURS, len(near) - 1))
     weights = jnp.sqrt(opacity[:, None] * opacity[others]) * jnp.exp(nearest / RADIUS**2)
     distances = jnp.sqrt(jnp.square(means[:, :, None] - means[:, others]).sum(-1) + SOFTNESS**2)
-    return (weights * jnp.abs(distances[1] - distances[0])).sum() / (weights.sum() + 1)
+    return (weights * jnp.abs(distances[1] - distances[0])).sum() / (weights.sum() + PSEUDO_COUNT)

@@ -25,15 +25,21 @@ def cloud(seed=0):
     return np.stack([first, first + rng.normal(0, RADIUS / 3, (N, 3))]), rng.uniform(0.1, 1, (2, N))
 
 
+def pairs(means, opacities):
+    """Every Gaussian with its nearest ones, and the weight of the pair."""
+    for i in range(N):
+        distances = np.linalg.norm(means[0, i] - means[0], axis=-1)
+        for j in np.argsort(distances)[1 : NEIGHBOURS + 1]:
+            opacity = np.sqrt(np.prod(opacities[:, i]) * np.prod(opacities[:, j]))
+            yield i, j, opacity * np.exp(-((distances[j] / RADIUS) ** 2))
+
+
 def expected(means, opacities):
     """One pair at a time."""
     total = weights = 0.0
-    for i in range(N):
-        distances = np.linalg.norm(means[:, i, None] - means, axis=-1)
-        for j in np.argsort(distances[0])[1 : NEIGHBOURS + 1]:
-            opacity = np.sqrt(np.prod(opacities[:, i]) * np.prod(opacities[:, j]))
-            weight = opacity * np.exp(-((distances[0, j] / RADIUS) ** 2))
-            total, weights = total + weight * abs(distances[1, j] - distances[0, j]), weights + weight
+    for i, j, weight in pairs(means, opacities):
+        first, second = np.linalg.norm(means[:, i] - means[:, j], axis=-1)
+        total, weights = total + weight * abs(second - first), weights + weight
     return total / (weights + 1)
 
 
@@ -63,9 +69,21 @@ def test_what_is_not_visible_at_both_instants_does_not_count():
 
 
 def test_gradients():
-    (first, second), opacities = jax.tree.map(jnp.asarray, cloud())
-    function = jax.jit(lambda second: change_of_distances(jnp.stack([first, second]), opacities))
-    check_grads(function, (second,), order=1, modes=("rev",), eps=1e-6, atol=1e-7, rtol=1e-5)
+    """With neighbours and weights held constant: numerically for the second instant, by formula for both."""
+    means, opacities = jax.tree.map(jnp.asarray, cloud())
+    second = jax.jit(lambda second: change_of_distances(jnp.stack([means[0], second]), opacities))
+    check_grads(second, (means[1],), order=1, modes=("rev",), eps=1e-6, atol=1e-7, rtol=1e-5)
+
+    slopes = np.zeros((2, N, 3))
+    for i, j, weight in pairs(*cloud()):
+        offsets = means[:, i] - means[:, j]
+        distances = jnp.linalg.norm(offsets, axis=-1, keepdims=True)
+        sign = jnp.sign(distances[1] - distances[0])
+        by_distance = weight * jnp.stack([-sign, sign]) * offsets / distances
+        slopes[:, i] += by_distance
+        slopes[:, j] -= by_distance
+    slopes /= sum(weight for _, _, weight in pairs(*cloud())) + 1
+    np.testing.assert_allclose(jax.grad(change_of_distances)(means, opacities), slopes, rtol=1e-3, atol=1e-5)
 
 
 def test_gradients_are_finite_where_all_are_in_one_place():
@@ -87,47 +105,92 @@ def scene_and_config():
     return scene._replace(params=params._replace(gaussians=gaussians)), config.model
 
 
-def test_it_is_that_of_moving_gaussians_at_two_near_instants(scene_and_config, monkeypatch):
-    """With room for few of them, those whose gates are open are drawn."""
-    scene, config = scene_and_config
-    monkeypatch.setattr(module, "DRAWN", int(scene.alive.sum()) // 3)
-    seen = {}
+def with_gaussians(scene, **fields):
+    return scene._replace(params=scene.params._replace(gaussians=scene.params.gaussians._replace(**fields)))
+
+
+@pytest.fixture
+def calls(monkeypatch):
+    """What was deformed and what came out, call by call."""
+    calls, deform = [], module.deform
 
     def spy(drawn, cameras, cfg, **options):
-        seen.update(gates=drawn.params.gaussians.gate, instants=cameras.time, share=cfg.moving_share)
-        return deform(drawn, cameras, cfg, **options)
+        calls.append((drawn, cameras, cfg, deform(drawn, cameras, cfg, **options)))
+        return calls[-1][-1]
 
-    deform = module.deform
     monkeypatch.setattr(module, "deform", spy)
+    return calls
+
+
+def test_moving_gaussians_are_drawn_and_compared_at_two_near_instants(scene_and_config, calls, monkeypatch):
+    scene, config = scene_and_config
+    monkeypatch.setattr(module, "DRAWN", int(scene.alive.sum()) // 3)
     gaps = []
     for seed in range(12):
         value = rigidity(scene, dataclasses.replace(config, moving_share=0.5), jax.random.key(seed))
-        first, second = map(float, seen["instants"])
+        drawn, cameras, cfg, moved = calls[-1]
+        np.testing.assert_allclose(value, change(moved.means / scene.extent, moved.opacities), rtol=1e-9)
         assert value > 0
+        assert np.all(drawn.params.gaussians.gate > 0)
+        assert cfg.moving_share == 1
+        first, second = map(float, cameras.time)
         assert 0 <= first < second <= 1
-        assert np.all(seen["gates"] > 0)
-        assert seen["share"] == 1
         gaps.append(second - first)
     assert 0.02 <= min(gaps) < 0.05 < 0.07 < max(gaps) <= 0.1
 
 
+def test_gaussians_on_paths_are_drawn_as_if_their_gates_were_open(scene_and_config, calls, monkeypatch):
+    scene, config = scene_and_config
+    rows = len(scene.alive)
+    on_path = scene.alive & (jnp.arange(rows) % 2 == 0)  # these have closed gates
+    lifetimes = jnp.where(on_path[:, None], jnp.array([0.0, 1.0]), jnp.array([-jnp.inf, jnp.inf]))
+    tracked = with_gaussians(scene, paths=jnp.zeros((rows, 4, 3)), lifetimes=lifetimes)
+    monkeypatch.setattr(module, "DRAWN", int(scene.alive.sum()) // 2)
+    shares = []
+    for seed in range(12):
+        rigidity(tracked, config, jax.random.key(seed))
+        shares.append(np.isfinite(calls[-1][0].params.gaussians.lifetimes).all(-1).mean())
+    assert 0.3 < np.mean(shares) < 0.7
+
+
+@pytest.mark.parametrize("factor", [1 / 1024, 1024])
+def test_a_larger_scene_costs_the_same(scene_and_config, factor):
+    scene, config = scene_and_config
+    config = dataclasses.replace(config, unit="depth")
+    larger = with_gaussians(scene, means=factor * scene.params.gaussians.means)
+    larger = larger._replace(bounds=factor * scene.bounds, extent=factor * scene.extent)
+    expected = rigidity(scene, config, jax.random.key(0))
+    np.testing.assert_allclose(rigidity(larger, config, jax.random.key(0)), expected, rtol=1e-6)
+
+
 def test_closed_gates_and_dead_rows_cost_nothing(scene_and_config):
     scene, config = scene_and_config
+    cost = lambda scene: rigidity(scene, config, jax.random.key(0))
     gates = scene.params.gaussians.gate
-    for still in (
-        scene._replace(
-            params=scene.params._replace(gaussians=scene.params.gaussians._replace(gate=jnp.full_like(gates, -1e3)))
-        ),
-        scene._replace(alive=jnp.zeros_like(scene.alive)),
-    ):
-        assert rigidity(still, config, jax.random.key(0)) < 1e-12
+    assert cost(scene) > 1e-4
+    assert cost(with_gaussians(scene, gate=None)) > 1e-4
+    assert cost(with_gaussians(scene, gate=jnp.full_like(gates, -1e3))) < 1e-12
+    assert cost(scene._replace(alive=jnp.zeros_like(scene.alive))) == 0
+    dead = jnp.where(scene.alive[:, None], scene.params.gaussians.means, jnp.nan)
+    np.testing.assert_allclose(cost(with_gaussians(scene, means=dead)), cost(scene), rtol=1e-9)
+
+
+@pytest.mark.parametrize("rows", [1, 2, 5])
+def test_few_gaussians_give_finite_values(scene_and_config, rows):
+    scene, config = scene_and_config
+    few = jax.tree.map(lambda x: x[:rows], scene.params.gaussians)
+    few = scene._replace(params=scene.params._replace(gaussians=few), alive=scene.alive[:rows])
+    value, slopes = jax.value_and_grad(
+        lambda params: rigidity(few._replace(params=params), config, jax.random.key(0)), allow_int=True
+    )(few.params)
+    assert all(np.isfinite(x).all() for x in jax.tree.leaves((value, slopes)))
 
 
 def test_gradients_reach_the_motion_field_and_not_the_look(scene_and_config):
     scene, config = scene_and_config
     slopes = jax.grad(lambda params: rigidity(scene._replace(params=params), config, jax.random.key(0)))(scene.params)
     size = lambda tree: max(float(jnp.abs(x).max()) for x in jax.tree.leaves(tree))
-    assert size(slopes.heads) > 0
-    assert size(slopes.hexplane) > 0
-    assert size(slopes.gaussians.reflectance) == 0
-    assert size(slopes.gaussians.logit_opacities) == 0
+    for moves in (slopes.heads, slopes.hexplane, slopes.gaussians.means, slopes.gaussians.gate):
+        assert size(moves) > 0
+    for looks in (slopes.gaussians.reflectance, slopes.gaussians.logit_opacities, slopes.gaussians.log_scales):
+        assert size(looks) == 0

@@ -19,7 +19,7 @@ def configure(unit, method="mcmc"):
         config,
         model=dataclasses.replace(config.model, unit=unit, relative_light=False),
         optim=dataclasses.replace(config.optim, extent_scales=("means",), **rates),
-        loss=dataclasses.replace(config.loss, depth=0.1, scale=0.1, opacity=0.1, rigidity=0.1),
+        loss=dataclasses.replace(config.loss, depth=0.1, scale=0.1, opacity=0.1),
         density=dataclasses.replace(config.density, method=method, start=0, interval=2, max_gaussians=40, noise=20.0),
     )
 
