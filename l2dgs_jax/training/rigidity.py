@@ -22,8 +22,8 @@ def rigidity(scene: Scene, cfg: ModelConfig, key: PRNGKeyArray) -> Float[Array, 
     """Mean change of the distances between neighbours from one random instant to another, in units of length.
 
     After the local isometry of Dynamic 3D Gaussians (arXiv 2308.09713), but between two near instants, and for a random
-    sample of the Gaussians. They are drawn in proportion to their motion gates, those on paths as if theirs were open.
-    Gradients flow to the centres, the gates, the paths and the motion field.
+    sample of the Gaussians. They are drawn in proportion to their motion gates; those on paths as if theirs were open,
+    if their lifetimes contain both instants. Gradients flow to the centres, the gates, the paths and the motion field.
 
     Args:
         scene: the scene; one without motion gates is sampled evenly.
@@ -32,17 +32,19 @@ def rigidity(scene: Scene, cfg: ModelConfig, key: PRNGKeyArray) -> Float[Array, 
     """
     for_sample, for_first, for_span = jax.random.split(key, 3)
     gaussians, dtype = scene.params.gaussians, scene.params.gaussians.means.dtype
+    span = jax.random.uniform(for_span, (), dtype, *SPANS)
+    first = (1 - span) * jax.random.uniform(for_first, (), dtype)
+    instants = jnp.stack([first, first + span])
     log_weights = jnp.where(scene.alive, 0 if gaussians.gate is None else jax.nn.log_sigmoid(gaussians.gate), -jnp.inf)
     if gaussians.lifetimes is not None:
-        log_weights = jnp.where(scene.alive & jnp.isfinite(gaussians.lifetimes).all(-1), 0, log_weights)
+        born, dies = gaussians.lifetimes.T
+        present = (born <= instants[0]) & (instants[1] <= dies)
+        on_path = scene.alive & jnp.isfinite(gaussians.lifetimes).all(-1)
+        log_weights = jnp.where(on_path, jnp.where(present, 0, -jnp.inf), log_weights)
     # The highest sums are draws without replacement (arXiv 1903.06059).
     scores = jax.lax.stop_gradient(log_weights) + jax.random.gumbel(for_sample, log_weights.shape, dtype)
     rows = jax.lax.top_k(scores, min(DRAWN, len(scores)))[1]
     drawn = jax.tree.map(lambda values: values[rows], gaussians)
-
-    span = jax.random.uniform(for_span, (), dtype, *SPANS)
-    first = (1 - span) * jax.random.uniform(for_first, (), dtype)
-    instants = jnp.stack([first, first + span])
     anywhere = lambda size: jnp.broadcast_to(jnp.eye(size, dtype=dtype), (2, size, size))
     moved = deform(
         scene._replace(params=scene.params._replace(gaussians=drawn), alive=scene.alive[rows]),
@@ -57,13 +59,14 @@ def rigidity(scene: Scene, cfg: ModelConfig, key: PRNGKeyArray) -> Float[Array, 
 def change_of_distances(means: Float[Array, "2 N 3"], opacities: Float[Array, "2 N"]) -> Float[Array, ""]:
     """Mean |change of distance| to the nearest neighbours between two instants; 0 if all move as one rigid body.
 
-    Neighbours are those of the first instant. A pair counts the more the nearer the two are, and the more opaque they
-    are at both instants. Gradients flow to `means`.
+    Neighbours are the nearest at the first instant of those that are visible at both. A pair counts the more the nearer
+    the two are, and the more opaque they are at both instants. Gradients flow to `means`.
     """
     near, opacity = jax.lax.stop_gradient((means[0], opacities[0] * opacities[1]))
     # Axis by axis, because sums along an axis of length 3 are slow on a CPU.
     squares = sum(jnp.square(axis[:, None] - axis[None]) for axis in near.T)
-    nearest, others = jax.lax.top_k(-squares - jnp.diag(jnp.full(len(near), jnp.inf)), min(NEIGHBOURS, len(near) - 1))
+    no_neighbour = jnp.eye(len(near), dtype=bool) | (opacity == 0)[None]
+    nearest, others = jax.lax.top_k(-jnp.where(no_neighbour, jnp.inf, squares), min(NEIGHBOURS, len(near) - 1))
     weights = jnp.sqrt(opacity[:, None] * opacity[others]) * jnp.exp(nearest / RADIUS**2)
     distances = jnp.sqrt(jnp.square(means[:, :, None] - means[:, others]).sum(-1) + SOFTNESS**2)
     return (weights * jnp.abs(distances[1] - distances[0])).sum() / (weights.sum() + PSEUDO_COUNT)
