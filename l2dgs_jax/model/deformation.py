@@ -6,7 +6,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from l2dgs_jax.cameras.geometry import camera_centres
 from l2dgs_jax.config import ModelConfig
@@ -132,12 +132,17 @@ def _on_paths(
     lifetime have no path: they stay in place, with a factor of 1.
     """
     knots = paths.shape[1]
-    has_path = jnp.isfinite(lifetimes).all(-1)
-    first, last = jnp.where(has_path[:, None], lifetimes, 0).T
+    follows = has_path(lifetimes)
+    first, last = jnp.where(follows[:, None], lifetimes, 0).T
     outside = jnp.maximum(first[None] - times[:, None], times[:, None] - last[None])
     visibility = jnp.clip(1 - (knots - 1) / FADE_DURATION * outside, 0, 1)
-    displacements = jnp.einsum("vk,nkc->vnc", path_weights(times, knots), jnp.where(has_path[:, None, None], paths, 0))
-    return displacements, jnp.where(has_path[None], visibility, 1)
+    displacements = jnp.einsum("vk,nkc->vnc", path_weights(times, knots), jnp.where(follows[:, None, None], paths, 0))
+    return displacements, jnp.where(follows[None], visibility, 1)
+
+
+def has_path(lifetimes: Float[Array, "N 2"]) -> Bool[Array, " N"]:
+    """Which Gaussians follow a path: those of finite lifetime."""
+    return jnp.isfinite(lifetimes).all(-1)
 
 
 def path_weights(times: Float[Array, " V"], knots: int) -> Float[Array, "V K"]:

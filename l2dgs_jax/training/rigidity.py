@@ -7,7 +7,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from l2dgs_jax.config import ModelConfig
-from l2dgs_jax.model.deformation import deform, length_unit
+from l2dgs_jax.model import compaction
+from l2dgs_jax.model.deformation import deform, has_path, length_unit
 from l2dgs_jax.types import Camera, Scene
 
 DRAWN = 1024  # Gaussians that are looked at in one step
@@ -39,15 +40,16 @@ def rigidity(scene: Scene, cfg: ModelConfig, key: PRNGKeyArray) -> Float[Array, 
     if gaussians.lifetimes is not None:
         born, dies = gaussians.lifetimes.T
         present = (born <= instants[0]) & (instants[1] <= dies)
-        on_path = scene.alive & jnp.isfinite(gaussians.lifetimes).all(-1)
-        log_weights = jnp.where(on_path, jnp.where(present, 0, -jnp.inf), log_weights)
+        log_weights = jnp.where(
+            scene.alive & has_path(gaussians.lifetimes), jnp.where(present, 0, -jnp.inf), log_weights
+        )
     # The highest sums are draws without replacement (arXiv 1903.06059).
     scores = jax.lax.stop_gradient(log_weights) + jax.random.gumbel(for_sample, log_weights.shape, dtype)
-    rows = jax.lax.top_k(scores, min(DRAWN, len(scores)))[1]
-    drawn = jax.tree.map(lambda values: values[rows], gaussians)
+    subset = compaction.highest(scores, min(DRAWN, len(scores)))
+    drawn = jax.tree.map(lambda values: compaction.select(values, subset, 0), gaussians)
     anywhere = lambda size: jnp.broadcast_to(jnp.eye(size, dtype=dtype), (2, size, size))
     moved = deform(
-        scene._replace(params=scene.params._replace(gaussians=drawn), alive=scene.alive[rows]),
+        scene._replace(params=scene.params._replace(gaussians=drawn), alive=scene.alive[subset.rows]),
         Camera(anywhere(4), anywhere(3), instants),  # motion does not depend on where the camera is
         dataclasses.replace(cfg, moving_share=1.0),
         moving=True,
