@@ -30,6 +30,15 @@ def project_points(
     return seen / np.where(depth > 0, depth, np.nan)[..., None], depth
 
 
+def pixel_rays(
+    pixels: Float[np.ndarray, "N 2"], viewmats: Float[np.ndarray, "N 4 4"], Ks: Float[np.ndarray, "N 3 3"]
+) -> Float[np.ndarray, "N 3"]:
+    """From each pixel's camera to what it shows at depth 1, in world axes."""
+    homogeneous = np.concatenate([pixels, np.ones((len(pixels), 1))], axis=-1)
+    local = np.einsum("nij,nj->ni", np.linalg.inv(Ks), homogeneous)
+    return np.einsum("nji,nj->ni", viewmats[:, :3, :3], local)
+
+
 def points_inside(
     points: Float[np.ndarray, "P 3"],
     viewmat: Float[np.ndarray, "4 4"],

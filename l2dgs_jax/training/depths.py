@@ -1,4 +1,4 @@
-"""Depths of tracks: near those of the scene's points around them, and similar for tracks that move alike."""
+"""Depths of tracks: in front of what they hide, as the scene's points show it, and similar if they move alike."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -6,6 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Float32, Int
 from scipy import sparse
+from scipy.ndimage import minimum_filter1d
+from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import cg
 from scipy.spatial import cKDTree
 
@@ -15,14 +17,18 @@ from l2dgs_jax.training.tracks import DEPTH_CELL, Tracks
 NEIGHBOURS = 30  # nearest points of a pixel that depths are taken from
 STATIC_QUANTILES = 0.03, 0.97  # of their depths, between which static surfaces may lie: a few points are outliers
 CANDIDATES = 4  # depths in that range, evenly spaced in inverse depth
-MOVING_QUANTILE = 0.08  # of their depths, the one assumed for what moves
 BORDER = 20  # pixels beyond the image in which points still count
 NEIGHBOUR_RADIUS = 9.0  # pixels within which tracks may belong to one object
-VELOCITY_SIGMA = 0.5  # standard deviation, in pixels per frame, of velocities within one object
-# Weights of squared differences of log-depths, relative to those from the depths of the points around
-NEIGHBOUR_WEIGHT = 10.0  # between neighbours, times the similarity of their motion
-CURVATURE_WEIGHT = 100.0  # second differences along a track
-CHANGE_WEIGHT = 1.0  # first differences along a track
+VELOCITY_SIGMA = 0.3  # standard deviation, in pixels per frame, of velocities within one object
+ALIKE = 0.5  # similarity of motion from which neighbours belong to one object
+COLUMNS = 6  # pixels to either side of an observation in which what its object hides counts
+# Weights of squared differences of log-distances, relative to the absolute ones from the guess times `TYPICAL_ERROR`
+NEIGHBOUR_WEIGHT = 1.0  # between neighbours, times the similarity of their motion
+CURVATURE_WEIGHT = 1000.0  # second differences along a track
+CHANGE_WEIGHT = 30.0  # first differences along a track
+TYPICAL_ERROR = 0.1  # of the guess, in log-distance
+SMALL_ERROR = 0.02  # below which errors of the guess count as squares
+ITERATIONS = 15
 
 
 class Depths(NamedTuple):
@@ -30,11 +36,11 @@ class Depths(NamedTuple):
 
     Attributes:
         still: C candidates for static surfaces, the nearest first.
-        moving: for what moves, which occludes the points around and so lies in front of most.
+        hidden: of the surface that something there would hide.
     """
 
     still: Float32[np.ndarray, "C *F h w"]
-    moving: Float32[np.ndarray, "*F h w"]
+    hidden: Float32[np.ndarray, "*F h w"]
 
 
 def depths_around(
@@ -54,8 +60,8 @@ def depths_around(
     cells = np.stack(np.meshgrid(columns, rows), axis=-1)
     _, around = cKDTree(pixels[inside]).query(cells, k=range(1, min(NEIGHBOURS, int(inside.sum())) + 1))
     low, high = STATIC_QUANTILES
-    near, front, far = np.quantile(depth[inside][around], (low, MOVING_QUANTILE, high), axis=-1)
-    return Depths((1 / np.linspace(1 / near, 1 / far, CANDIDATES)).astype(np.float32), front.astype(np.float32))
+    near, median, far = np.quantile(depth[inside][around], (low, 0.5, high), axis=-1)
+    return Depths((1 / np.linspace(1 / near, 1 / far, CANDIDATES)).astype(np.float32), median.astype(np.float32))
 
 
 def depths_at(tracks: Tracks, depths: Float32[np.ndarray, "F h w"]) -> Float32[np.ndarray, " O"]:
@@ -64,34 +70,76 @@ def depths_at(tracks: Tracks, depths: Float32[np.ndarray, "F h w"]) -> Float32[n
     return depths[tracks.frames, rows, columns]
 
 
-def shared_depths(tracks: Sequence[Tracks], depths: Float32[np.ndarray, "F h w"]) -> list[Float[np.ndarray, " O"]]:
+def shared_depths(
+    tracks: Sequence[Tracks], hidden: Float32[np.ndarray, "F h w"], horizontal: Sequence[Float[np.ndarray, " _"]]
+) -> list[Float[np.ndarray, " O"]]:
     """Depths of all observations of the tracks, solved for jointly, world units.
 
-    They are near those of the cells, change smoothly along a track, and are similar where neighbours in a frame move
-    alike: the points around an object show its surroundings, and give different depths to its parts and instants.
+    Solved for are horizontal distances, because they are the same for all parts of an upright object. The first guess
+    is the nearest that the object hides: most objects stand on something, which is what their lowest part hides. This
+    is wrong where only the upper part is in view, or what seems to be one object is several; so the solution may depart
+    from it, and changes smoothly along a track and between neighbours that move alike.
 
     Args:
         tracks: at least one, each with at least one observation in a cell of known depth.
-        depths: of the cells, NaN where unknown.
+        hidden: depths of the cells, NaN where unknown.
+        horizontal: of each track's observations, the horizontal distance per unit of depth, positive; 1 for all if it
+            is unknown where up is.
     """
     lengths = [len(track.frames) for track in tracks]
     merged = Tracks(*(np.concatenate(parts) for parts in zip(*tracks, strict=True)))
-    prior = np.log(np.concatenate([depths_at(track, depths) for track in tracks]).astype(np.float64))
-    known = np.isfinite(prior)
-    prior = np.where(known, prior, prior[known].mean())
-    owner = np.repeat(np.arange(len(tracks)), lengths)
-
     first, second, similarity = _neighbours(merged, np.concatenate([_velocities(track.pixels) for track in tracks]))
+    alike = similarity > ALIKE
+    per_depth = np.concatenate(horizontal)
+    behind = per_depth * np.concatenate([depths_at(track, hidden) for track in tracks])
+    guess = np.log(_nearest_hidden(merged, behind, first[alike], second[alike]))
+    known = np.isfinite(guess)
+    guess = np.where(known, guess, guess[known].mean())
+
+    owner = np.repeat(np.arange(len(tracks)), lengths)
     steps, bends = (np.flatnonzero(owner[n:] == owner[:-n]) for n in (1, 2))
-    count = len(prior)
+    count = len(guess)
     terms = (
         _differences(count, (first, second), (1, -1), NEIGHBOUR_WEIGHT * similarity),
         _differences(count, (steps, steps + 1), (1, -1), CHANGE_WEIGHT),
         _differences(count, (bends, bends + 1, bends + 2), (1, -2, 1), CURVATURE_WEIGHT),
     )
-    normal = sparse.diags_array(known.astype(float)) + sum(term.T @ term for term in terms)
-    found, _ = cg(normal.tocsr(), known * prior, x0=prior, rtol=1e-4, maxiter=500)
-    return np.split(np.exp(found), np.cumsum(lengths)[:-1])
+    smoothness = sum(term.T @ term for term in terms)
+    found = guess
+    for _ in range(ITERATIONS):  # least absolute errors by reweighted least squares
+        weights = known * TYPICAL_ERROR / np.maximum(np.abs(found - guess), SMALL_ERROR)
+        normal = (sparse.diags_array(weights) + smoothness).tocsr()
+        found, _ = cg(normal, weights * guess, x0=found, rtol=1e-4, maxiter=500)
+    return np.split(np.exp(found) / per_depth, np.cumsum(lengths)[:-1])
+
+
+def _nearest_hidden(
+    tracks: Tracks,
+    behind: Float[np.ndarray, " O"],
+    first: Int[np.ndarray, " E"],
+    second: Int[np.ndarray, " E"],
+) -> Float[np.ndarray, " O"]:
+    """For each observation, the smallest distance behind its object in the columns around; NaN if none is known.
+
+    An object is what pairs of observations (`first`, `second`) of one frame connect.
+    """
+    count = len(behind)
+    _, objects = connected_components(sparse.coo_array((np.ones(len(first)), (first, second)), (count, count)), False)
+    columns = tracks.pixels[:, 0].astype(int)
+    nearest = np.empty(count)
+    for group in _by_frame(tracks):
+        _, rows = np.unique(objects[group], return_inverse=True)
+        profile = np.full((rows.max() + 1, columns.max() + 1), np.inf)
+        np.fmin.at(profile, (rows, columns[group]), behind[group])
+        lowest = minimum_filter1d(profile, 2 * COLUMNS + 1, axis=1, mode="constant", cval=np.inf)
+        nearest[group] = lowest[rows, columns[group]]
+    return np.where(np.isfinite(nearest), nearest, np.nan)
+
+
+def _by_frame(tracks: Tracks) -> list[Int[np.ndarray, " N"]]:
+    """The observations of each frame that has any."""
+    order = np.argsort(tracks.frames, kind="stable")
+    return np.split(order, np.flatnonzero(np.diff(tracks.frames[order])) + 1)
 
 
 def _velocities(pixels: Float[np.ndarray, "O 2"]) -> Float[np.ndarray, "O 2"]:
@@ -104,10 +152,8 @@ def _neighbours(
     tracks: Tracks, velocities: Float[np.ndarray, "O 2"]
 ) -> tuple[Int[np.ndarray, " E"], Int[np.ndarray, " E"], Float[np.ndarray, " E"]]:
     """Pairs of observations that are close to each other in a frame, and how similarly they move, in (0, 1]."""
-    by_frame = np.argsort(tracks.frames, kind="stable")
-    groups = np.split(by_frame, np.flatnonzero(np.diff(tracks.frames[by_frame])) + 1)
     close = lambda pixels: cKDTree(pixels).query_pairs(NEIGHBOUR_RADIUS, output_type="ndarray")
-    pairs = [group[close(tracks.pixels[group])] for group in groups]
+    pairs = [group[close(tracks.pixels[group])] for group in _by_frame(tracks)]
     first, second = np.concatenate(pairs).T
     squared = np.square(velocities[first] - velocities[second]).sum(-1)
     return first, second, np.exp(-squared / (2 * VELOCITY_SIGMA**2))

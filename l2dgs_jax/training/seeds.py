@@ -4,13 +4,15 @@ Points from structure from motion lie on static surfaces. A motion field that st
 out which of them to move where; tracks of optical flow tell before training begins.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Float32
 
-from l2dgs_jax.cameras.geometry import camera_centres, project_points
+from l2dgs_jax.cameras.geometry import camera_centres, pixel_rays, project_points
+from l2dgs_jax.cameras.ground import ground_normal, horizontal_per_depth
 from l2dgs_jax.data.dataset import Split
 from l2dgs_jax.model.deformation import path_weights
 from l2dgs_jax.model.initialisation import Seeds, path_knots, z_order
@@ -21,6 +23,7 @@ from l2dgs_jax.training.tracks import SPACING, Tracks, find_tracks
 MIN_LENGTH = 3  # frames that a track must be seen in
 MIN_MOVING_SHARE = 0.4  # share of these frames in which it must be seen to move
 MIN_DEVIATION = 3.0  # pixels that a track must at some time be away from where a static point would appear
+MIN_HORIZONTAL = 0.2  # horizontal distance per unit of depth below which a camera looks down too steeply
 STIFFNESS = 1e-3  # weight of squared second differences of a path, relative to squared distances from the track
 
 
@@ -43,7 +46,8 @@ def find_seeds(points: Float[np.ndarray, "P 3"], split: Split, most: int) -> See
     if not chosen:
         shapes = ((0, 3), (0, 3), (0,), (0, knots, 3), (0, 2))
         return Seeds(*(np.zeros(shape, np.float32) for shape in shapes))
-    depths = shared_depths(chosen, np.stack([depths.moving for depths in around]))
+    hidden = np.stack([depths.hidden for depths in around])
+    depths = shared_depths(chosen, hidden, _horizontal(chosen, cameras, ground_normal(points, cameras.viewmat)))
     seeds = [_seed(split, cameras, weights, *track) for track in zip(chosen, depths, strict=True)]
     found = Seeds(*(np.array(rows, np.float32) for rows in zip(*seeds, strict=True)))
     order = z_order(found.points)
@@ -114,9 +118,21 @@ def _fitted_path(weights: Float[np.ndarray, "O K"], places: Float[np.ndarray, "O
     return np.linalg.solve(normal, weights.T @ places)
 
 
+def _horizontal(
+    tracks: Sequence[Tracks], cameras: _Cameras, up: Float[np.ndarray, "3"] | None
+) -> list[Float[np.ndarray, " _"]]:
+    """Horizontal distance per unit of depth; 1 for all if it is unknown where up is, or cameras look too steeply."""
+    if up is not None:
+        factors = [
+            horizontal_per_depth(track.pixels, cameras.viewmat[track.frames], cameras.K[track.frames], up)
+            for track in tracks
+        ]
+        if min(factor.min() for factor in factors) > MIN_HORIZONTAL:
+            return factors
+    return [np.ones(len(track.frames)) for track in tracks]
+
+
 def _unprojected(tracks: Tracks, cameras: _Cameras, depth: Float[np.ndarray, " O"]) -> Float[np.ndarray, "O 3"]:
     """World points of observations at those depths."""
     viewmat, K = cameras.viewmat[tracks.frames], cameras.K[tracks.frames]
-    homogeneous = np.concatenate([tracks.pixels, np.ones((len(depth), 1))], axis=-1)
-    rays = np.einsum("oij,oj->oi", np.linalg.inv(K), homogeneous)
-    return camera_centres(viewmat) + np.einsum("oji,oj->oi", viewmat[:, :3, :3], depth[:, None] * rays)
+    return camera_centres(viewmat) + depth[:, None] * pixel_rays(tracks.pixels, viewmat, K)

@@ -20,27 +20,32 @@ def cells(value=2.0):
     return np.full((FRAMES, HEIGHT // DEPTH_CELL, WIDTH // DEPTH_CELL), value, np.float32)
 
 
+def solved(tracks, hidden, factors=1.0):
+    """Depths of tracks whose horizontal distance is that many times their depth."""
+    return shared_depths(tracks, hidden, [np.broadcast_to(factors, len(one.frames)) for one in tracks])
+
+
 def test_depths_around_are_ordered_and_lie_within_those_of_the_points():
     rng = np.random.default_rng(0)
     points = np.concatenate([rng.uniform(-3, 3, (4000, 2)), rng.uniform(2, 6, (4000, 1))], axis=-1)
-    still, moving = depths_around(points, np.eye(4), K, HEIGHT, WIDTH)
-    assert still.shape[1:] == moving.shape == (HEIGHT // DEPTH_CELL, WIDTH // DEPTH_CELL)
+    still, hidden = depths_around(points, np.eye(4), K, HEIGHT, WIDTH)
+    assert still.shape[1:] == hidden.shape == (HEIGHT // DEPTH_CELL, WIDTH // DEPTH_CELL)
     assert (np.diff(still, axis=0) > 0).all()
-    assert (still[0] <= moving).all()
-    assert (moving < still.mean(0)).all()
+    assert (still[0] < hidden).all()
+    assert (hidden < still[-1]).all()
     assert still.min() >= 2
     assert still.max() <= 6
 
 
 def test_without_points_in_view_depths_are_unknown():
-    still, moving = depths_around(np.array([[0, 0, -1.0]]), np.eye(4), K, HEIGHT, WIDTH)
+    still, hidden = depths_around(np.array([[0, 0, -1.0]]), np.eye(4), K, HEIGHT, WIDTH)
     assert np.isnan(still).all()
-    assert np.isnan(moving).all()
+    assert np.isnan(hidden).all()
 
 
 def test_a_depth_on_which_all_agree_is_kept():
     tracks = [track(0, (4.5, 4.5), (1, 0.5)), track(1, (8.5, 6.5), (1, 0.5))]
-    for depth in shared_depths(tracks, cells()):
+    for depth in solved(tracks, cells()):
         assert_allclose(depth, 2, rtol=1e-3)
 
 
@@ -50,16 +55,47 @@ def test_neighbours_share_a_depth_if_they_move_alike():
     depths[:, 1:] = 4.0  # depth of the points around the second track
     difference = {}
     for velocity in (1.0, -1.0):
-        near, far = shared_depths([first, track(1, (8.5, 6.5), (velocity, 0))], depths)
+        near, far = solved([first, track(1, (8.5, 6.5), (velocity, 0))], depths)
         difference[velocity] = np.mean(far - near)
     assert difference[1.0] < 0.1
     assert difference[-1.0] > 1.5
 
 
+def test_an_object_is_as_near_as_the_nearest_surface_that_it_hides():
+    depths = cells(4.0)
+    depths[:, 3:] = 2.0  # the ground that the lowest part stands on
+    alike = [track(i, (4.5, 1.5 + 4 * i), (1, 0)) for i in range(5)]
+    assert_allclose(solved(alike, depths), 2, rtol=1e-3)
+    apart = [track(i, (15.5, 1.5 + 4 * i), (i - 2, 0)) for i in range(5)]
+    assert solved(apart, depths)[0].min() > 3.5
+
+
+def test_an_upright_object_has_one_horizontal_distance():
+    alike = [track(i, (4.5, 4.5 + 4 * i), (1, 0)) for i in range(3)]
+    factors = [np.full(FRAMES, factor) for factor in (1.0, 0.9, 0.8)]
+    found = shared_depths(alike, cells(), factors)
+    assert_allclose(found * np.array(factors), 1.6, rtol=1e-3)  # that of the lowest part, at depth 2
+
+
+def test_what_an_object_hides_in_distant_columns_does_not_count():
+    depths = cells(4.0)
+    depths[:, :, 6:] = 2.0
+    row = [track(i, (2.5 + 5 * i, 12.5), (0, 0.5)) for i in range(6)]
+    found = solved(row, depths)
+    assert found[-1].max() < 3 < found[0].min()
+
+
+def test_a_few_wrong_depths_do_not_move_a_track():
+    depths = cells(4.0)
+    depths[3] = 1.0
+    (depth,) = solved([track(0, (4.5, 4.5), (1, 0.5))], depths)
+    assert_allclose(depth, 4, rtol=0.1)
+
+
 def test_depth_changes_gradually_along_a_track():
     depths = cells()
     depths[4:] = 3.0
-    (depth,) = shared_depths([track(0, (4.5, 4.5), (1, 0.5))], depths)
+    (depth,) = solved([track(0, (4.5, 4.5), (1, 0.5))], depths)
     assert (np.diff(depth) > 0).all()
     assert np.diff(depth).max() < 0.3
 
@@ -67,5 +103,5 @@ def test_depth_changes_gradually_along_a_track():
 def test_where_no_point_is_in_view_depth_comes_from_the_rest_of_the_track():
     depths = cells()
     depths[3:5] = np.nan
-    (depth,) = shared_depths([track(0, (4.5, 4.5), (1, 0.5))], depths)
+    (depth,) = solved([track(0, (4.5, 4.5), (1, 0.5))], depths)
     assert_allclose(depth, 2, rtol=1e-3)

@@ -1,0 +1,62 @@
+"""The ground that things stand on, as far as the points of a scene show it, and distances along it."""
+
+import numpy as np
+from jaxtyping import Float
+
+from l2dgs_jax.cameras.geometry import mean_up, pixel_rays
+
+DRAWS = 2000  # planes through three random points each
+COUNTED = 2000  # random points that vote for them
+TOLERANCE = 0.01  # distance of a point from its plane, over the median distance of points from their median
+MIN_SHARE = 0.1  # of the points that must lie on the ground
+MAX_TILT = 55.0  # degrees between the ground's normal and the cameras' mean upward direction
+
+
+def ground_normal(
+    points: Float[np.ndarray, "P 3"], viewmats: Float[np.ndarray, "F 4 4"]
+) -> Float[np.ndarray, "3"] | None:
+    """The upward unit normal of the plane that most points lie on; None if few do, or cameras are held otherwise.
+
+    The plane is found by RANSAC and fitted to its points by least squares. The same points give the same plane.
+
+    Args:
+        points: of the scene, world units.
+        viewmats: of the cameras.
+    """
+    if len(points) < 3:
+        return None
+    rng = np.random.default_rng(0)
+    tolerance = TOLERANCE * np.median(np.linalg.norm(points - np.median(points, axis=0), axis=-1))
+    up = mean_up(viewmats)
+    first, second, third = points[rng.integers(len(points), size=(3, DRAWS))]
+    normals = np.cross(second - first, third - first)
+    lengths = np.linalg.norm(normals, axis=-1)
+    level = (lengths > 0) & (np.abs(normals @ up) > np.cos(np.radians(MAX_TILT)) * lengths)
+    if not level.any():
+        return None
+    first, normals = first[level], normals[level] / lengths[level, None]
+    voters = points[rng.permutation(len(points))[:COUNTED]]
+    votes = (np.abs(normals @ voters.T - (normals * first).sum(-1)[:, None]) < tolerance).mean(-1)
+    best = np.argmax(votes)
+    if votes[best] < MIN_SHARE:
+        return None
+    on_ground = points[np.abs((points - first[best]) @ normals[best]) < tolerance]
+    normal = np.linalg.svd(on_ground - on_ground.mean(0), full_matrices=False)[2][-1]
+    return normal * np.sign(normal @ up)
+
+
+def horizontal_per_depth(
+    pixels: Float[np.ndarray, "N 2"],
+    viewmats: Float[np.ndarray, "N 4 4"],
+    Ks: Float[np.ndarray, "N 3 3"],
+    up: Float[np.ndarray, "3"],
+) -> Float[np.ndarray, " N"]:
+    """Distance along the camera's viewing direction, taken horizontally, of what a pixel shows at depth 1.
+
+    Points above each other have the same horizontal distance, but different depths if the camera looks up or down. It
+    is 0 or less where a ray leads straight down or backwards.
+    """
+    forward = viewmats[:, 2, :3]
+    level = forward - np.outer(forward @ up, up)
+    lengths = np.maximum(np.linalg.norm(level, axis=-1), np.finfo(float).tiny)
+    return (pixel_rays(pixels, viewmats, Ks) * level).sum(-1) / lengths
