@@ -1,4 +1,4 @@
-"""Depths of tracks: in front of what they hide, as the scene's points show it, and similar if they move alike."""
+"""Depths of tracks: those of the nearest surfaces that objects hide, and similar for tracks that move alike."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -22,7 +22,7 @@ NEIGHBOUR_RADIUS = 9.0  # pixels within which tracks may belong to one object
 VELOCITY_SIGMA = 0.3  # standard deviation, in pixels per frame, of velocities within one object
 ALIKE = 0.5  # similarity of motion from which neighbours belong to one object
 COLUMNS = 6  # pixels to either side of an observation in which what its object hides counts
-# Weights of squared differences of log-distances, relative to the absolute ones from the guess times `TYPICAL_ERROR`
+# Weights of squared differences of log-distances; the absolute error of the guess counts `TYPICAL_ERROR` times
 NEIGHBOUR_WEIGHT = 1.0  # between neighbours, times the similarity of their motion
 CURVATURE_WEIGHT = 1000.0  # second differences along a track
 CHANGE_WEIGHT = 30.0  # first differences along a track
