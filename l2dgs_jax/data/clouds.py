@@ -84,7 +84,7 @@ def read_ply(path: Path) -> Cloud:
     try:
         rows = _vertices(lines, body.partition(b"\n")[2])
         points = np.stack([rows[axis].astype(np.float64) for axis in "xyz"], -1)
-    except (ValueError, KeyError, IndexError, TypeError) as error:
+    except (ValueError, KeyError, IndexError, TypeError, OverflowError) as error:
         raise UserError(f"{path}: not a PLY file of points ({error}); expected vertices with x, y, z") from None
     if not found or not len(points) or not np.isfinite(points).all():
         raise UserError(f"{path}: holds no points or some that are not finite; expected a cloud of finite points")
@@ -130,6 +130,7 @@ def _vertices(lines: Sequence[Sequence[str]], body: bytes) -> Shaped[np.ndarray,
 
     Raises:
         ValueError, KeyError, IndexError, TypeError: the header is malformed, or the body too short.
+        OverflowError: the header tells of more vertices than a file can hold.
     """
     if not lines or lines[0] != ["ply"]:
         raise ValueError("it does not begin with 'ply'")

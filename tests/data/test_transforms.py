@@ -226,6 +226,12 @@ FAULTS = {
         "points3D.ply: not a PLY",
         lambda s: (s / "points3D.ply").write_bytes((s / "points3D.ply").read_bytes()[:-5]),
     ),
+    "a cloud of too many points": (
+        "points3D.ply: not a PLY",
+        lambda s: (s / "points3D.ply").write_bytes(
+            (s / "points3D.ply").read_bytes().replace(b"element vertex ", b"element vertex 9" + 20 * b"9", 1)
+        ),
+    ),
     "cameras that look nowhere in common": (
         "the cameras look at no common place",
         lambda s: [
