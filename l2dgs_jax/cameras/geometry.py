@@ -31,12 +31,12 @@ def project_points(
 
 
 def pixel_rays(
-    pixels: Float[np.ndarray, "N 2"], viewmats: Float[np.ndarray, "N 4 4"], Ks: Float[np.ndarray, "N 3 3"]
+    pixels: Float[np.ndarray, "N 2"], viewmats: Float[np.ndarray, "*C 4 4"], Ks: Float[np.ndarray, "*C 3 3"]
 ) -> Float[np.ndarray, "N 3"]:
-    """From each pixel's camera to what it shows at depth 1, in world axes."""
+    """From the camera to what a pixel shows at depth 1, in world axes; one camera, or one for each pixel."""
     homogeneous = np.concatenate([pixels, np.ones((len(pixels), 1))], axis=-1)
-    local = np.einsum("nij,nj->ni", np.linalg.inv(Ks), homogeneous)
-    return np.einsum("nji,nj->ni", viewmats[:, :3, :3], local)
+    local = np.einsum("...ij,...j->...i", np.linalg.inv(Ks), homogeneous)
+    return np.einsum("...ji,...j->...i", viewmats[..., :3, :3], local)
 
 
 def points_inside(

@@ -20,7 +20,7 @@ from l2dgs_jax.cameras.epipolar import (
     proposed,
 )
 from l2dgs_jax.cameras.flow import brightened, matcher, pixel_indices
-from l2dgs_jax.cameras.geometry import camera_centres, points_inside
+from l2dgs_jax.cameras.geometry import camera_centres, pixel_rays, points_inside
 from l2dgs_jax.data.dataset import Split
 from l2dgs_jax.runtime.prefetch import prefetch
 from l2dgs_jax.types import Camera
@@ -219,9 +219,8 @@ def _uncovered(points: Float[np.ndarray, "P 3"], depths: DepthMap, spacing: int)
     free[row[covers] // spacing, column[covers] // spacing] = np.nan
 
     row, column = (np.broadcast_to(centre, free.shape)[np.isfinite(free)] for centre in centres)
-    pixels = np.stack([column + 0.5, row + 0.5, np.ones(len(row))], axis=-1)
-    local = pixels @ np.linalg.inv(K).T / free[np.isfinite(free)][:, None]
-    return local @ viewmat[:3, :3] + camera_centres(viewmat)
+    pixels = np.stack([column + 0.5, row + 0.5], axis=-1)
+    return camera_centres(viewmat) + pixel_rays(pixels, viewmat, K) / free[np.isfinite(free)][:, None]
 
 
 def _depth_ratios(points: Float[np.ndarray, "P 3"], depths: DepthMap) -> Float[np.ndarray, " P"]:
