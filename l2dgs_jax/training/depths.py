@@ -1,4 +1,4 @@
-"""Depths of tracks: those of the nearest surfaces that objects hide, and similar for tracks that move alike."""
+"""Depths of tracks: as given, or of the nearest surface that an object hides; similar for tracks that move alike."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -26,6 +26,7 @@ COLUMNS = 6  # pixels to either side of an observation in which what its object 
 NEIGHBOUR_WEIGHT = 1.0  # between neighbours, times the similarity of their motion
 CURVATURE_WEIGHT = 1000.0  # second differences along a track
 CHANGE_WEIGHT = 30.0  # first differences along a track
+GIVEN_WEIGHT = 10.0  # depth that came with the scene, compared with a guess
 TYPICAL_ERROR = 0.1  # of the guess, in log-distance
 SMALL_ERROR = 0.02  # below which errors of the guess count as squares
 ITERATIONS = 15
@@ -71,20 +72,24 @@ def depths_at(tracks: Tracks, depths: Float32[np.ndarray, "F h w"]) -> Float32[n
 
 
 def shared_depths(
-    tracks: Sequence[Tracks], hidden: Float32[np.ndarray, "F h w"], horizontal: Sequence[Float[np.ndarray, " _"]]
+    tracks: Sequence[Tracks],
+    hidden: Float32[np.ndarray, "F h w"],
+    horizontal: Sequence[Float[np.ndarray, " _"]],
+    given: Sequence[Float[np.ndarray, " _"]],
 ) -> list[Float[np.ndarray, " O"]]:
     """Depths of all observations of the tracks, solved for jointly, world units.
 
-    Solved for are horizontal distances, because they are the same for all parts of an upright object. The first guess
-    is the nearest that the object hides: most objects stand on something, which is what their lowest part hides. This
-    is wrong where only the upper part is in view, or what seems to be one object is several; so the solution may depart
-    from it, and changes smoothly along a track and between neighbours that move alike.
+    Solved for are horizontal distances, because they are the same for all parts of an upright object. Where no depth is
+    given, the first guess is the nearest that the object hides: most objects stand on something, which is what their
+    lowest part hides. This is wrong where only the upper part is in view, or what seems to be one object is several; so
+    the solution may depart from it, and changes smoothly along a track and between neighbours that move alike.
 
     Args:
         tracks: at least one, each with at least one observation in a cell of known depth.
         hidden: depths of the cells, NaN where unknown.
         horizontal: of each track's observations, the horizontal distance per unit of depth, positive; 1 for all if it
             is unknown where up is.
+        given: of each track's observations, the depth that came with the scene, world units; NaN where unknown.
     """
     lengths = [len(track.frames) for track in tracks]
     merged = Tracks(*(np.concatenate(parts) for parts in zip(*tracks, strict=True)))
@@ -92,8 +97,10 @@ def shared_depths(
     alike = similarity > ALIKE
     per_depth = np.concatenate(horizontal)
     behind = per_depth * np.concatenate([depths_at(track, hidden) for track in tracks])
-    guess = np.log(_nearest_hidden(merged, behind, first[alike], second[alike]))
+    told = per_depth * np.concatenate(given)
+    guess = np.log(np.where(np.isfinite(told), told, _nearest_hidden(merged, behind, first[alike], second[alike])))
     known = np.isfinite(guess)
+    trust = TYPICAL_ERROR * known * np.where(np.isfinite(told), GIVEN_WEIGHT, 1)
     guess = np.where(known, guess, guess[known].mean())
 
     owner = np.repeat(np.arange(len(tracks)), lengths)
@@ -107,7 +114,7 @@ def shared_depths(
     smoothness = sum(term.T @ term for term in terms)
     found = guess
     for _ in range(ITERATIONS):  # least absolute errors by reweighted least squares
-        weights = known * TYPICAL_ERROR / np.maximum(np.abs(found - guess), SMALL_ERROR)
+        weights = trust / np.maximum(np.abs(found - guess), SMALL_ERROR)
         normal = (sparse.diags_array(weights) + smoothness).tocsr()
         found, _ = cg(normal, weights * guess, x0=found, rtol=1e-4, maxiter=500)
     return np.split(np.exp(found) / per_depth, np.cumsum(lengths)[:-1])

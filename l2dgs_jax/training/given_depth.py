@@ -1,13 +1,18 @@
-"""How far rendered depth is from depth that came with the scene, whose scale and shift are unknown."""
+"""Depth that came with the scene, at an unknown scale and shift: its distance from rendered depth, and its unit."""
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+import numpy as np
+from jaxtyping import Array, Bool, Float, Float32, Int
+
+from l2dgs_jax.cameras.geometry import points_inside
 
 MIN_ALPHA = 0.5  # accumulated opacity above which a pixel has a depth
 HUBER_DELTA = 0.02  # of the mean inverse depth: differences below it count quadratically, above it linearly
 MIN_DEVIATION = 1e-4  # standard deviation, over the mean, below which given inverse depth counts as constant
 FIT_ITERATIONS = 20  # of reweighted least squares for scale and shift
+MIN_POINTS = 10  # in a frame, to find its scale and shift by
+POINT_TOLERANCE = 0.1  # of the median inverse depth of points: one that is farther off counts little
 
 
 def depth_disagreement(
@@ -55,3 +60,41 @@ def _over_mean(values: Float[Array, "V H W"], counted: Bool[Array, "V H W"]) -> 
     count = jnp.maximum(counted.sum((1, 2), keepdims=True), 1).astype(values.dtype)
     mean = values.sum((1, 2), keepdims=True) / count
     return values / jnp.where(mean > 0, mean, 1)
+
+
+def in_world_units(
+    given: Float32[np.ndarray, "H W"],
+    points: Float[np.ndarray, "P 3"],
+    viewmat: Float[np.ndarray, "4 4"],
+    K: Float[np.ndarray, "3 3"],
+) -> Float[np.ndarray, "H W"]:
+    """Depth given for one frame at the scale and shift of its inverse that suit the scene's points best.
+
+    Points that other things hide in this frame are outliers. Least squares are therefore reweighted in the manner of
+    Geman and McClure, whose weights fall fast enough for those not to matter.
+
+    Args:
+        given: depth in any unit, 0 where unknown.
+        points: world units.
+        viewmat: of the frame's camera.
+        K: likewise.
+
+    Returns:
+        Depth in world units, NaN where unknown, and everywhere if too few points are in view or agree with it.
+    """
+    height, width = given.shape
+    _, pixels, distances = points_inside(points, viewmat, K, (width, height))
+    columns, rows = pixels.astype(int).T
+    told = given[rows, columns]
+    if (told > 0).sum() < MIN_POINTS:
+        return np.full(given.shape, np.nan)
+    terms = np.stack([1 / told[told > 0], np.ones((told > 0).sum())], axis=-1).astype(np.float64)
+    target = 1 / distances[told > 0]
+    weights = np.ones(len(target))
+    for _ in range(FIT_ITERATIONS):
+        (scale, shift), *_ = np.linalg.lstsq(weights[:, None] * terms, weights * target)
+        errors = (terms @ (scale, shift) - target) / (POINT_TOLERANCE * np.median(target))
+        weights = 1 / (1 + errors**2)  # roots of the weights of squares
+    inverse = np.where(given > 0, scale / np.where(given > 0, given, 1) + shift, np.nan)
+    agrees = scale > 0 and np.median(np.abs(errors)) < 1
+    return np.where(agrees & (inverse > 0), 1 / np.where(inverse > 0, inverse, 1), np.nan)

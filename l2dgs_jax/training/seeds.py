@@ -18,6 +18,7 @@ from l2dgs_jax.model.deformation import path_weights
 from l2dgs_jax.model.initialisation import Seeds, path_knots, z_order
 from l2dgs_jax.training.depths import depths_around, depths_at, shared_depths
 from l2dgs_jax.training.flows import neighbour_flows
+from l2dgs_jax.training.given_depth import in_world_units
 from l2dgs_jax.training.tracks import SPACING, Tracks, find_tracks
 
 MIN_LENGTH = 3  # frames that a track must be seen in
@@ -29,6 +30,8 @@ STIFFNESS = 1e-3  # weight of squared second differences of a path, relative to 
 
 def find_seeds(points: Float[np.ndarray, "P 3"], split: Split, most: int) -> Seeds:
     """Seeds on what moves between the frames; none where no flow can be trusted.
+
+    If the scene has depth maps, they tell how far away the seeds are, after being fitted to the points.
 
     Args:
         points: of the scene, world units.
@@ -47,7 +50,8 @@ def find_seeds(points: Float[np.ndarray, "P 3"], split: Split, most: int) -> See
         shapes = ((0, 3), (0, 3), (0,), (0, knots, 3), (0, 2))
         return Seeds(*(np.zeros(shape, np.float32) for shape in shapes))
     hidden = np.stack([depths.hidden for depths in around])
-    depths = shared_depths(chosen, hidden, _horizontal(chosen, cameras, ground_normal(points, cameras.viewmat)))
+    horizontal = _horizontal(chosen, cameras, ground_normal(points, cameras.viewmat))
+    depths = shared_depths(chosen, hidden, horizontal, _given_depths(chosen, cameras, points, split))
     seeds = [_seed(split, cameras, weights, *track) for track in zip(chosen, depths, strict=True)]
     found = Seeds(*(np.array(rows, np.float32) for rows in zip(*seeds, strict=True)))
     order = z_order(found.points)
@@ -130,6 +134,18 @@ def _horizontal(
         if min(factor.min() for factor in factors) > MIN_HORIZONTAL:
             return factors
     return [np.ones(len(track.frames)) for track in tracks]
+
+
+def _given_depths(
+    tracks: Sequence[Tracks], cameras: _Cameras, points: Float[np.ndarray, "P 3"], split: Split
+) -> list[Float[np.ndarray, " _"]]:
+    """The scene's own depth at the tracks, world units; NaN where it has none."""
+    if split.depths is None:
+        return [np.full(len(track.frames), np.nan) for track in tracks]
+    frames = zip(split.depths, cameras.viewmat, cameras.K, strict=True)
+    maps = np.stack([in_world_units(given, points, viewmat, K) for given, viewmat, K in frames])
+    indices = ((track.frames, *np.flipud(track.pixels.astype(int).T)) for track in tracks)
+    return [maps[index] for index in indices]
 
 
 def _unprojected(tracks: Tracks, cameras: _Cameras, depth: Float[np.ndarray, " O"]) -> Float[np.ndarray, "O 3"]:

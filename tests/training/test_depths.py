@@ -1,6 +1,7 @@
 """Depths of tracks, estimated from the points around them and shared by neighbours that move alike."""
 
 import numpy as np
+import pytest
 from numpy.testing import assert_allclose
 
 from l2dgs_jax.training.depths import depths_around, shared_depths
@@ -20,9 +21,10 @@ def cells(value=2.0):
     return np.full((FRAMES, HEIGHT // DEPTH_CELL, WIDTH // DEPTH_CELL), value, np.float32)
 
 
-def solved(tracks, hidden, factors=1.0):
+def solved(tracks, hidden, factors=1.0, given=np.nan):
     """Depths of tracks whose horizontal distance is that many times their depth."""
-    return shared_depths(tracks, hidden, [np.broadcast_to(factors, len(one.frames)) for one in tracks])
+    everywhere = lambda value: [np.broadcast_to(value, len(one.frames)) for one in tracks]
+    return shared_depths(tracks, hidden, everywhere(factors), everywhere(given))
 
 
 def test_depths_around_are_ordered_and_lie_within_those_of_the_points():
@@ -73,7 +75,7 @@ def test_an_object_is_as_near_as_the_nearest_surface_that_it_hides():
 def test_an_upright_object_has_one_horizontal_distance():
     alike = [track(i, (4.5, 4.5 + 4 * i), (1, 0)) for i in range(3)]
     factors = [np.full(FRAMES, factor) for factor in (1.0, 0.9, 0.8)]
-    found = shared_depths(alike, cells(), factors)
+    found = shared_depths(alike, cells(), factors, [np.full(FRAMES, np.nan)] * 3)
     assert_allclose(found * np.array(factors), 1.6, rtol=1e-3)  # that of the lowest part, at depth 2
 
 
@@ -105,3 +107,15 @@ def test_where_no_point_is_in_view_depth_comes_from_the_rest_of_the_track():
     depths[3:5] = np.nan
     (depth,) = solved([track(0, (4.5, 4.5), (1, 0.5))], depths)
     assert_allclose(depth, 2, rtol=1e-3)
+
+
+def test_depth_that_is_given_outweighs_the_guess():
+    (depth,) = solved([track(0, (4.5, 4.5), (1, 0.5))], cells(), given=np.where(np.arange(FRAMES) == 3, 1.5, np.nan))
+    assert_allclose(depth[3], 1.5, rtol=0.05)
+    assert depth[-1] > depth[3]
+
+
+@pytest.mark.parametrize("factor", [1.0, 0.7])
+def test_given_depth_is_no_horizontal_distance(factor):
+    (depth,) = solved([track(0, (4.5, 4.5), (1, 0.5))], cells(), factor, 1.5)
+    assert_allclose(depth, 1.5, rtol=1e-3)

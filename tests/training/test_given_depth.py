@@ -8,7 +8,7 @@ from jax.test_util import check_grads
 from scipy.optimize import minimize
 
 from l2dgs_jax.training import given_depth
-from l2dgs_jax.training.given_depth import HUBER_DELTA, depth_disagreement
+from l2dgs_jax.training.given_depth import HUBER_DELTA, depth_disagreement, in_world_units
 
 V, H, W = 2, 6, 8
 disagreement = jax.jit(depth_disagreement)
@@ -96,3 +96,44 @@ def test_disagreement_is_the_mean_over_views():
     arrays = views()
     each = [disagreement(*(x[v : v + 1] for x in arrays)) for v in range(V)]
     np.testing.assert_allclose(disagreement(*arrays), np.mean(each), rtol=1e-9)
+
+
+K = np.array([[40.0, 0, 16], [0, 40.0, 12], [0, 0, 1]])
+
+
+def slope(count=300, hidden=0):
+    """Depth of a slope in a frame of 32x24, and points on it, some of them moved far behind it."""
+    depth = np.broadcast_to(np.linspace(2, 5, 24)[:, None], (24, 32)).astype(np.float32)
+    rng = np.random.default_rng(0)
+    rows, columns = rng.integers(24, size=count), rng.integers(32, size=count)
+    distances = np.where(np.arange(count) < hidden, rng.uniform(1.3, 3, count), 1) * depth[rows, columns]
+    points = distances[:, None] * (np.stack([columns + 0.5, rows + 0.5, np.ones(count)], axis=-1) @ np.linalg.inv(K).T)
+    return depth, points
+
+
+@pytest.mark.parametrize("hidden", [0, 100])
+def test_given_depth_gets_the_unit_of_the_points(hidden):
+    depth, points = slope(hidden=hidden)
+    given = (1 / (3 / depth + 0.5)).astype(np.float32)
+    np.testing.assert_allclose(in_world_units(given, points, np.eye(4), K), depth, rtol=1e-2)
+
+
+def test_unknown_depth_stays_unknown():
+    depth, points = slope()
+    given = np.where(np.arange(32) < 10, 0, depth).astype(np.float32)
+    found = in_world_units(given, points, np.eye(4), K)
+    assert np.isnan(found[:, :10]).all()
+    np.testing.assert_allclose(found[:, 10:], depth[:, 10:], rtol=1e-5)
+
+
+@pytest.mark.parametrize("why", ["few points", "no points in view", "contradiction", "flat"])
+def test_depth_that_points_do_not_bear_out_is_unknown(why):
+    depth, points = slope(count=9 if why == "few points" else 300)
+    if why == "no points in view":
+        points = points - [0, 0, 100]
+    elif why == "contradiction":
+        depth = depth[::-1].copy()
+    elif why == "flat":
+        depth = np.full_like(depth, 3)
+    found = in_world_units(depth, points, np.eye(4), K)
+    assert np.isnan(found).all()

@@ -12,6 +12,7 @@ import pytest
 from clips import FOCAL, HEIGHT, WIDTH, clip
 from tiny_training import FRAMES, assert_equal_states, finish, make_dataset, state_of, tiny
 
+from l2dgs_jax.cameras.geometry import camera_centres, pixel_rays, points_inside
 from l2dgs_jax.config import overrides
 from l2dgs_jax.data import Split
 from l2dgs_jax.model.deformation import path_weights
@@ -23,6 +24,7 @@ from l2dgs_jax.training.seeds import find_seeds
 from l2dgs_jax.types import Camera
 
 COUNT, MANY = 14, 10_000
+SQUARE = -0.5  # where on the z axis the moving square is
 K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]], np.float32)
 
 
@@ -98,6 +100,28 @@ def test_seeds_of_the_first_and_of_the_last_frame_are_visible_before_and_after_t
     visible = lambda time: np.count_nonzero((first <= time) & (time <= last))
     assert visible(0.0) == visible(cameras.time[0]) > 0
     assert visible(1.0) == visible(cameras.time[-1]) > 0
+
+
+def measured(split, squares):
+    """Depth at the pixels of the points and of the square, in an unknown unit and with an unknown shift."""
+    depths = np.zeros(split.images.shape[:3], np.float32)
+    for depth, square, viewmat in zip(depths, squares, split.cameras.viewmat, strict=True):
+        _, pixels, distances = points_inside(surfaces(), viewmat, K, (WIDTH, HEIGHT))
+        order = np.argsort(-distances)  # the nearest point of a pixel is the one that remains
+        columns, rows = pixels[order].astype(int).T
+        depth[rows, columns] = distances[order]
+        rows, columns = np.nonzero(square)
+        rays = pixel_rays(np.stack([columns, rows], axis=-1) + 0.5, viewmat, K)
+        depth[rows, columns] = (SQUARE - camera_centres(viewmat)[2]) / rays[:, 2]
+        depth[depth > 0] = 1 / (3 / depth[depth > 0] + 0.5)
+    return depths
+
+
+def test_seeds_lie_where_measured_depth_puts_them():
+    split, squares = filmed(block=True)
+    seeds = find_seeds(surfaces(), dataclasses.replace(split, depths=measured(split, squares)), MANY)
+    error = lambda seeds: np.abs(seeds.points[:, 2] - SQUARE)
+    assert np.quantile(error(seeds), 0.8) < 0.05 < 0.5 * np.median(error(found()))
 
 
 @pytest.mark.parametrize("why", ["noise", "no points in view", "not valid"])
