@@ -70,7 +70,7 @@ class Train:
     devices: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
     quiet: _Flag = False
     json: _Flag = False
-    report: _Flag = True
+    report: Annotated[_Flag, tyro.conf.arg(help_behavior_hint="(default: it is written)")] = True
     tensorboard: _Flag = False
     view: _Flag = False
     view_host: str = "127.0.0.1"

@@ -56,6 +56,7 @@ VARIANTS = {
     "tenth_moving": TENTH_MOVING,
     "without_paths": overrides.replace(CONFIG, {"model.tracks": False}),
     "without_gates": overrides.replace(CONFIG, {"model.motion_gate": False}),
+    "with_rigidity": overrides.replace(CONFIG, {"loss.rigidity": 1.0}),
 }
 # Gaussians, width, height.
 RASTERIZER_SIZES = {
