@@ -36,7 +36,8 @@ def main(arguments: Sequence[str]) -> None:
     try:
         found = prepare(options.source, options.output, options.capture)
     except OSError as error:
-        raise UserError(f"{options.output}: cannot be made ({error.strerror}); expected a writable place") from None
+        place = error.filename or options.output
+        raise UserError(f"{place}: {error.strerror}; expected a readable source and a writable output") from None
     except KeyboardInterrupt:
         print("\ninterrupted; the same command goes on from here", file=sys.stderr)
         sys.exit(130)

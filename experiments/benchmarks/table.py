@@ -38,7 +38,7 @@ TABLES = {
         "Adam": "parts adam_ms",
         "rendering well-lit frames": "rendering welllit_frames_per_s",
         "the motion field acting on a tenth of the Gaussians": "rendering tenth_moving_welllit_frames_per_s",
-        "before the first step, demo clip (39 frames of 256x192): flow for views between frames": "seeding demo_flow_ms",
+        "before the first step of the demo (39 frames, 256x192): flow for views in between": "seeding demo_flow_ms",
         "tracks of moving objects, with their flow": "seeding demo_flow_and_seeds_ms",
         "points on static surfaces": "seeding demo_surfaces_ms",
         "peak memory of steps at 800x450 with 50,000 Gaussians": "memory 50k_800x450_peak_gib",

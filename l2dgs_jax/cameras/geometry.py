@@ -1,4 +1,4 @@
-"""Where cameras are, how far they spread, one camera out of many, and cameras of other image sizes."""
+"""Pixels of points and rays of pixels, how cameras lie and spread, and cameras made from others."""
 
 from typing import TypeVar
 

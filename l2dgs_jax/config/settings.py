@@ -341,6 +341,12 @@ class Config:
             ("--model.initial-opacity", model.initial_opacity, 0 < model.initial_opacity < 1, "between 0 and 1"),
             ("--model.sh-degree", model.sh_degree, 0 <= model.sh_degree <= 3, "a whole number from 0 to 3"),
             ("--model.tone", model.tone, _is_exponent(model.tone), "an exponent between 1 and 10, or a name"),
+            (
+                "--model.initial-illumination",
+                model.initial_illumination,
+                not (model.relative_light and model.initial_illumination is None),
+                'a number or "auto", which --model.relative-light divides by',
+            ),
         ):
             if not fits:
                 raise UserError(f"{name} {value}: expected {expected}")

@@ -1,9 +1,11 @@
-"""The sRGB transfer function and its inverse, for NumPy and jax arrays."""
+"""The sRGB transfer function and its inverse, for NumPy and jax arrays, and how much to brighten sRGB values."""
 
 from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Array
+
+MID_GREY = 0.46  # photographers' middle grey, 18 % of linear light, in sRGB
 
 AnyArray = TypeVar("AnyArray", Array, np.ndarray)
 
@@ -19,3 +21,8 @@ def linear_to_srgb(value: AnyArray) -> AnyArray:
     where = value.__array_namespace__().where
     low = value <= 0.0031308  # includes 0, where the gradient of the power is not finite
     return where(low, value * 12.92, 1.055 * where(low, 1, value) ** (1 / 2.4) - 0.055)
+
+
+def brightening_exponent(mean: float, target: float) -> float:
+    """The exponent that would bring values of that mean to the mean `target`, were they all equal; at most 1."""
+    return float(np.log(target) / np.log(np.clip(mean, 1e-3, target)))

@@ -37,7 +37,7 @@ def observed_colors(
     frames = prefetch(lambda i: _observed(points, cameras, images, valid, i), range(len(images)))
     seen = stacked(frames, shape, images.dtype, in_file=math.prod(shape) > VALUES_IN_MEMORY)
     chunk = max(VALUES_IN_MEMORY // (3 * len(images)), 1)
-    parts = [_nan_median(seen[:, i : i + chunk].astype(np.float32)) for i in range(0, len(points), chunk)]
+    parts = [_nan_median(seen[:, i : i + chunk].astype(np.float32)) for i in range(0, max(len(points), 1), chunk)]
     colors = np.concatenate(parts)
     return np.where(np.isnan(colors).all(-1, keepdims=True), pixel_mean(images, valid).astype(colors.dtype), colors)
 

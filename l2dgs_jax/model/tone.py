@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
-from l2dgs_jax.data.color import linear_to_srgb, srgb_to_linear
+from l2dgs_jax.data.color import MID_GREY, linear_to_srgb, srgb_to_linear
 
 Tone = Literal["linear-light", "gain"]
 
@@ -17,7 +17,6 @@ MIN_EXPONENT, MAX_EXPONENT = 1.01, 2.0  # B1 can come close to 1, not reach it
 NOISE_QUANTILE, MAX_CLEAN_NOISE, MAX_FLAT_CONTRAST = 0.1, 1 / 255, 0.5
 NOISE_WINDOW = 7  # side in pixels of the window that local noise is measured in
 SAMPLED_FRAMES = 12
-MID_GREY = 0.46  # photographers' middle grey, 18 % linear, in sRGB
 # The level is lowered until the brightened highlights, a high quantile of the pixels, do not exceed a value; but only
 # down to a part of itself, as a lamp in view must not leave all else in the dark.
 HIGHLIGHT_QUANTILE, MAX_HIGHLIGHTS, MIN_LEVEL_FACTOR = 0.98, 0.9, 0.5

@@ -11,12 +11,12 @@ from jaxtyping import Float, Float32
 
 from l2dgs_jax.config import Enhancement
 from l2dgs_jax.data import Dataset
+from l2dgs_jax.data.color import MID_GREY, brightening_exponent
 from l2dgs_jax.data.dataset import Split
 from l2dgs_jax.data.stacks import MappedArray, stacked
 from l2dgs_jax.preprocess import zero_dce
 from l2dgs_jax.runtime.prefetch import prefetch
 
-TARGET_MEAN = 0.46  # of frames after the gamma: photographers' middle grey, 18 % of linear light, in sRGB
 CLIP_LIMIT, TILES = 3.0, (8, 8)  # of CLAHE
 
 Enhancer = Callable[[Float32[np.ndarray, "H W 3"]], Float[np.ndarray, "H W 3"]]
@@ -47,7 +47,7 @@ def _enhancer(split: Split, method: Enhancement, seed: int) -> Enhancer:
     if method == "zero-dce":
         net, bend = zero_dce.learn(split.images, seed), jax.jit(zero_dce.brighten)
         return lambda image: np.asarray(bend(net, jnp.asarray(image, float)[None])[0])
-    exponent = np.float32(np.log(TARGET_MEAN) / np.log(np.clip(split.mean_level, 1e-3, TARGET_MEAN)))
+    exponent = np.float32(brightening_exponent(split.mean_level, MID_GREY))
     if method == "gamma":
         return lambda image: image**exponent
 

@@ -9,8 +9,8 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from tqdm import tqdm
 
 from l2dgs_jax.model.networks import apply_conv, init_conv
-from l2dgs_jax.preprocess.lowlight.curve_network import block_means, iterate, smoothness_loss, squared_steps, train
-from l2dgs_jax.training.losses import exposure
+from l2dgs_jax.preprocess.lowlight.curve_network import BLOCK, iterate, smoothness_loss, squared_steps, train
+from l2dgs_jax.training.losses import block_means, exposure
 from l2dgs_jax.training.optimizer import Schedule
 from l2dgs_jax.types import Conv
 
@@ -56,7 +56,7 @@ def loss(net: Net, images: Float[Array, "B H W 3"]) -> Scalar:
     means = bright.mean((1, 2))
     tints = means - jnp.roll(means, 1, axis=-1)
     return (
-        SPATIAL_WEIGHT * squared_steps(block_means((bright - images).mean(-1))[..., None])
+        SPATIAL_WEIGHT * squared_steps(block_means((bright - images).mean(-1), BLOCK)[..., None])
         + EXPOSURE_WEIGHT * exposure(bright, EXPOSURE_LEVEL, EXPOSURE_WINDOW, "squared")
         + COLOR_WEIGHT * jnp.square(tints).sum(-1).mean()
         + SMOOTHNESS_WEIGHT * smoothness_loss(parameters)

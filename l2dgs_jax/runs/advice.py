@@ -31,6 +31,6 @@ def misfit(dataset: Dataset, config: Config) -> str | None:
     if len(dataset.train.names) < FEW_FRAMES:
         return f"{len(dataset.train.names)} frames are few to learn motion from; expect it to be coarse"
     grows = config.density.start < config.density.stop
-    if len(dataset.points) < FEW_POINTS and not grows:
+    if len(dataset.points) < FEW_POINTS and not (grows or config.model.surfaces):
         return f"{len(dataset.points)} points are few and none are added; expect blur, or add some (--density.stop)"
     return None

@@ -13,9 +13,8 @@ from l2dgs_jax.config import Config
 from l2dgs_jax.data import Dataset
 from l2dgs_jax.data.images import encode_jpeg, to_bytes
 from l2dgs_jax.runs.run import Run
-from l2dgs_jax.runtime.capacity import next_capacity
 from l2dgs_jax.runtime.files import make_folder, replacing
-from l2dgs_jax.training.state import TrainState, with_capacity
+from l2dgs_jax.training.state import TrainState
 
 PREVIEWS = "previews"
 VIEWS = {"held-out": "test", "training": "train"}  # names of the views, and the splits that they are from
@@ -71,7 +70,7 @@ def draw(folder: Path, dataset: Dataset, config: Config, state: TrainState) -> l
     Raises:
         UserError: a file cannot be written.
     """
-    run = Run(config, dataset, with_last_capacity(state, config))
+    run = Run(config, dataset, state)
     files: list[Path] = []
     for view, split_name in VIEWS.items():
         split = getattr(dataset, split_name)
@@ -107,13 +106,6 @@ def drop_after(folder: Path, step: int) -> None:
 
 def _path(folder: Path, view: str, kind: str, step: int | None = None) -> Path:
     return folder / PREVIEWS / view / (f"{kind}.jpg" if step is None else f"{kind}-{step:06d}.jpg")
-
-
-def with_last_capacity(state: TrainState, config: Config) -> TrainState:
-    """Pad a state to its number of rows at the end of the run, if known: every number of rows is a compilation."""
-    cfg, rows = config.density, len(state.scene.alive)
-    most = int(cfg.max_gaussians) if cfg.method == "mcmc" and cfg.start < cfg.stop else 0
-    return with_capacity(state, next_capacity(most)) if most > rows else state
 
 
 def _write(path: Path, picture: UInt8[np.ndarray, "H W 3"]) -> None:

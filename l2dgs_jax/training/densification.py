@@ -79,9 +79,9 @@ def densify(
 ) -> Densified:
     """Prune transparent Gaussians, then clone small and split large ones among those of large screen-space gradients.
 
-    A clone leaves its source alone; a split moves the source to one sample of itself and a new row to another, both
-    smaller. If `cfg.max_gaussians` leaves too few rows, those with the largest gradients win. Nothing here is
-    differentiable.
+    A clone leaves its source alone, except for its opacity with `cfg.conserve_opacity`; a split moves the source to one
+    sample of itself and a new row to another, both smaller. If `cfg.max_gaussians` leaves too few rows, those with the
+    largest gradients win. Nothing here is differentiable.
     """
     capacity = alive.shape[0]
     transparent = jax.nn.sigmoid(gaussians.logit_opacities) < cfg.prune_opacity
@@ -112,7 +112,7 @@ def densify(
     return Densified(
         gaussians=written,
         alive=alive_kept | born,
-        changed=pruned | split | born,
+        changed=pruned | born | (chosen if cfg.conserve_opacity else split),
         wanted=wanted,
         missing=jnp.maximum(wanted - free, 0),
     )

@@ -78,6 +78,8 @@ def run(members: Sequence[Member], pair_capacity: int | None = None, mesh: Mesh 
         DivergedError: no member is left.
     """
     config, start = members[0].config, min(int(member.state.step) for member in members)
+    if start >= config.steps:
+        return
     member_shards, view_shards = (mesh.shape[MEMBERS], mesh.shape[VIEWS]) if mesh else (1, 1)
     views = config.batch_size // view_shards
     pair_capacity = pair_capacity or max(first_capacity(m.split, m.state.scene, views) for m in members)
@@ -249,7 +251,7 @@ def _stack_states(states: Sequence[TrainState]) -> TrainState:
 
 
 def _complaint(report: StepReport, step: int) -> str:
-    """What was found in the last member that diverged, as far as this process can see it."""
+    """What this process's first member reports."""
     terms = {name: value.addressable_shards[0].data[0] for name, value in report.terms.items()}
     found = ", ".join(f"{name} {float(value):.3g}" for name, value in terms.items())
     return f"the loss or its gradient is not finite at step {step} ({found})"

@@ -76,6 +76,8 @@ def resolve(config: Config, dataset: Dataset) -> Config:
     if "auto" not in (*(model.initial_exponents or ()), model.initial_illumination):
         return config
     exponent, gain, _ = split_darkening(split, config)
+    if model.decomposition != "retinex":
+        model = dataclasses.replace(model, initial_exponents=None)  # there are no B1 and B2
     if model.initial_exponents and model.initial_exponents[0] == "auto":
         model = dataclasses.replace(model, initial_exponents=(round(exponent, 3), model.initial_exponents[1]))
     if model.initial_illumination == "auto":

@@ -126,16 +126,21 @@ def exposure(
             larger than the image: one block, the whole image.
         form: |mean - e| (paper) or (mean - e)^2 (Zero-DCE's code).
     """
-    *batch, height, width, _ = image.shape
     intensity = image.mean(-1)
-    if window is None or window > min(height, width):
+    if window is None or window > min(intensity.shape[-2:]):
         means = intensity.mean((-2, -1))
     else:
-        rows, columns = height // window, width // window
-        whole = intensity[..., : rows * window, : columns * window]
-        means = whole.reshape(*batch, rows, window, columns, window).mean((-3, -1))
+        means = block_means(intensity, window)
     distance = means - level
     return (jnp.abs(distance) if form == "absolute" else distance**2).mean()
+
+
+def block_means(values: Float[Array, "*B H W"], side: int) -> Float[Array, "*B h w"]:
+    """Means over square blocks of that side in pixels; blocks that the image cuts off are left out."""
+    *batch, height, width = values.shape
+    rows, columns = height // side, width // side
+    whole = values[..., : rows * side, : columns * side]
+    return whole.reshape(*batch, rows, side, columns, side).mean((-3, -1))
 
 
 def depth_smoothness(
@@ -144,7 +149,7 @@ def depth_smoothness(
     """Edge-aware smoothness (Eq. 12): depth steps count less where the image has an edge; both carry gradients.
 
     Args:
-        depth: D, world units.
+        depth: D, in any unit.
         image: I_w.
         gradient: forward differences, or unnormalised 3x3 Sobel filters with zeros beyond the image (the authors').
             The image gradient is averaged over channels in absolute value.

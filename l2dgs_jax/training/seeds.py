@@ -140,12 +140,15 @@ def _given_depths(
     tracks: Sequence[Tracks], cameras: _Cameras, points: Float[np.ndarray, "P 3"], split: Split
 ) -> list[Float[np.ndarray, " _"]]:
     """The scene's own depth at the tracks, world units; NaN where it has none."""
-    if split.depths is None:
-        return [np.full(len(track.frames), np.nan) for track in tracks]
-    frames = zip(split.depths, cameras.viewmat, cameras.K, strict=True)
-    maps = np.stack([in_world_units(given, points, viewmat, K) for given, viewmat, K in frames])
-    indices = ((track.frames, *np.flipud(track.pixels.astype(int).T)) for track in tracks)
-    return [maps[index] for index in indices]
+    frames = np.concatenate([track.frames for track in tracks])
+    columns, rows = np.concatenate([track.pixels for track in tracks]).astype(int).T
+    depths = np.full(len(frames), np.nan)
+    if split.depths is not None:
+        for frame in np.unique(frames):
+            here = frames == frame
+            depth = in_world_units(split.depths[frame], points, cameras.viewmat[frame], cameras.K[frame])
+            depths[here] = depth[rows[here], columns[here]]
+    return np.split(depths, np.cumsum([len(track.frames) for track in tracks])[:-1])
 
 
 def _unprojected(tracks: Tracks, cameras: _Cameras, depth: Float[np.ndarray, " O"]) -> Float[np.ndarray, "O 3"]:

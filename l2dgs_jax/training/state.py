@@ -45,7 +45,7 @@ class StepReport(NamedTuple):
     """What a step found. The state is unchanged if the pair buffer overflowed or a gradient was not finite.
 
     Attributes:
-        loss: Eq. 15 plus the plane regularisers.
+        loss: the sum of all terms with their weights (Eq. 15, regularisers and terms that the paper does not have).
         terms: each term, unweighted.
         psnr: of the low-light estimate against the input, dB, before the step.
         pairs: (Gaussian, tile) pairs that the step needs; if views are spread over devices, the most on any of them.

@@ -36,6 +36,14 @@ class Tracks(NamedTuple):
     moves: Bool[np.ndarray, " O"]
 
 
+class _Heads(NamedTuple):
+    """The tracks that have come to a frame: number, pixel, and average deviation from a static scene in pixels."""
+
+    numbers: Int[np.ndarray, " N"]
+    pixels: Float[np.ndarray, "N 2"]
+    deviations: Float[np.ndarray, " N"]
+
+
 def find_tracks(split: Split, flows: Flows, depths: Float32[np.ndarray, "C F h w"]) -> Tracks:
     """Follow what moves from frame to frame, as long as flow can be trusted.
 
@@ -56,21 +64,14 @@ def find_tracks(split: Split, flows: Flows, depths: Float32[np.ndarray, "C F h w
         column, row = (pixels // SPACING).astype(int).T
         return row * width + column
 
-    class Heads(NamedTuple):
-        """The tracks that have come to a frame: number, pixel, and average deviation from a static scene in pixels."""
-
-        numbers: Int[np.ndarray, " N"]
-        pixels: Float[np.ndarray, "N 2"]
-        deviations: Float[np.ndarray, " N"]
-
-    none = Heads(np.zeros(0, int), np.zeros((0, 2)), np.zeros(0))
-    arrived: dict[int, list[Heads]] = {frame: [none] for frame in range(len(times))}
+    none = _Heads(np.zeros(0, int), np.zeros((0, 2)), np.zeros(0))
+    arrived: dict[int, list[_Heads]] = {frame: [none] for frame in range(len(times))}
     observed, count = [], 0
     for frame in np.argsort(times, kind="stable").tolist():
-        heads = Heads(*(np.concatenate(parts) for parts in zip(*arrived.pop(frame), strict=True)))
+        heads = _Heads(*(np.concatenate(parts) for parts in zip(*arrived.pop(frame), strict=True)))
         order = np.argsort(-heads.deviations, kind="stable")
         first = order[np.unique(cell(heads.pixels[order]), return_index=True)[1]]
-        heads = Heads(*(x[first] for x in heads))
+        heads = _Heads(*(x[first] for x in heads))
         following = int(flows.following[frame])
         if following == frame:
             unmoved = np.zeros(len(heads.numbers), bool)
@@ -87,7 +88,7 @@ def find_tracks(split: Split, flows: Flows, depths: Float32[np.ndarray, "C F h w
         fresh = grid[_at(moves, grid) & ~np.isin(cell(grid), cell(heads.pixels))]
         numbers = count + np.arange(len(fresh))
         count += len(fresh)
-        heads = Heads(*(np.concatenate(x) for x in zip(heads, (numbers, fresh, np.zeros(len(fresh))), strict=True)))
+        heads = _Heads(*(np.concatenate(x) for x in zip(heads, (numbers, fresh, np.zeros(len(fresh))), strict=True)))
         seen = np.full(len(heads.numbers), frame), heads.pixels, _at(moves, heads.pixels)
         observed.append(Tracks(heads.numbers, *seen))
 
@@ -95,7 +96,7 @@ def find_tracks(split: Split, flows: Flows, depths: Float32[np.ndarray, "C F h w
         inside = ((ends >= 0) & (ends < (width, height))).all(-1)  # not where flow is NaN
         latest = np.nan_to_num(_at(deviations, heads.pixels))
         average = (1 - UPDATE_WEIGHT) * heads.deviations + UPDATE_WEIGHT * latest
-        arrived[following].append(Heads(heads.numbers[inside], ends[inside], average[inside]))
+        arrived[following].append(_Heads(heads.numbers[inside], ends[inside], average[inside]))
     merged = Tracks(*(np.concatenate(parts) for parts in zip(*observed, strict=True)))
     order = np.lexsort((times[merged.frames], merged.numbers))
     return Tracks(*(x[order] for x in merged))

@@ -40,7 +40,7 @@ def live(
             nonlocal server, due
             if progress.step <= previews.first(config) or time.monotonic() < due or (server and not server.watched()):
                 return
-            state = previews.with_last_capacity(devices.member(progress.states, 0), config)
+            state = devices.member(progress.states, 0)
             if server:
                 server.show(state)
             else:

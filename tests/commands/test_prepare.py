@@ -199,7 +199,7 @@ def test_a_fault_is_named_in_one_sentence_and_nothing_is_written(tmp_path, fault
 def test_an_output_that_cannot_be_written_is_named(tmp_path):
     source = pictures(tmp_path)
     (tmp_path / "file").write_text("")
-    with pytest.raises(UserError, match=r"out: cannot be made \(Not a directory\); expected a writable place"):
+    with pytest.raises(UserError, match=r"out.partial: Not a directory; expected .* a writable output"):
         run(source, tmp_path / "file" / "out")
 
 

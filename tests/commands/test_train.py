@@ -327,6 +327,8 @@ def test_what_cannot_start_leaves_no_folder(refuses, scene, tmp_path, monkeypatc
     refuses(scene, "--model.moving-share=0", "--output", tmp_path / "run", naming=["--model.moving-share 0"])
     tone = ("--model.domain", "light", "--model.tone", "1.2")
     refuses(scene, *tone, "--output", tmp_path / "run", naming=["--model.tone 1.2", "--model.domain values"])
+    unlit = "--model.initial-illumination"
+    refuses(scene, unlit, "None", "--output", tmp_path / "run", naming=[f"{unlit} None", "--model.relative-light"])
     refuses(scene, "--model.plane-size=1", "--output", tmp_path / "run", naming=["--model.plane-size 1", "at least 2"])
     assert not (tmp_path / "run").exists()
 

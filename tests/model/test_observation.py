@@ -51,6 +51,11 @@ def test_observed_colors_are_the_same_when_few_are_held_at_once(monkeypatch, at_
     assert 5 < seen_more_than_once < len(POINTS)
 
 
+def test_no_points_have_no_colors():
+    images = np.full((3, 12, 16, 3), 0.2)
+    assert observation.observed_colors(np.zeros((0, 3)), cameras([[0, 0, 0]] * 3), images).shape == (0, 3)
+
+
 def wall(frames, gains):
     """A textured wall that the camera sees from the same place in every frame, exposed differently."""
     texture = np.random.default_rng(5).uniform(0.1, 0.4, (12, 16, 3))

@@ -38,6 +38,9 @@ def test_a_misfit_gives_a_warning_of_one_line(dataset, density, words):
 
 def test_few_points_give_no_warning_if_gaussians_are_added():
     assert misfit(dataset_of(points=20), tiny(density=GROWING)) is None
+    config = tiny(density=FIXED)
+    surfaces = dataclasses.replace(config, model=dataclasses.replace(config.model, surfaces=True))
+    assert misfit(dataset_of(points=20), surfaces) is None
 
 
 def test_a_camera_that_stands_still_needs_another_unit_than_that_of_its_path():

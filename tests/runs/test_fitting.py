@@ -54,6 +54,14 @@ def test_a_training_goes_on_from_a_state(dataset, quick):
     assert fit(dataset, config, start=Checkpoint(finished, 2048)).state is finished
 
 
+@pytest.mark.parametrize("decomposition", ["none", "curve"])
+def test_without_a_decomposition_there_are_no_exponents(dataset, decomposition):
+    model = dataclasses.replace(PRESETS["default"].model, decomposition=decomposition, tracks=False, surfaces=False)
+    config = resolve(tiny(model=model), dataset)
+    assert config.model.initial_exponents is None
+    assert initial_state(dataset, config).scene.params.curves is not None or decomposition == "none"
+
+
 def test_black_frames_are_refused(dataset):
     black = dataclasses.replace(dataset.train, images=np.zeros_like(dataset.train.images))
     with pytest.raises(UserError, match="tiny: all its training frames are black"):

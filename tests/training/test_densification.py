@@ -141,3 +141,4 @@ def test_with_conserve_opacity_a_pair_has_the_joint_opacity_of_its_source():
         after = jax.nn.sigmoid(result.gaussians.logit_opacities)
         np.testing.assert_allclose(1 - (1 - after[chosen]) * (1 - after[3]), before[chosen], rtol=1e-9)
         np.testing.assert_array_equal(np.delete(after, [chosen, 3]), np.delete(before, [chosen, 3]))
+        np.testing.assert_array_equal(np.flatnonzero(result.changed), [chosen, 3])

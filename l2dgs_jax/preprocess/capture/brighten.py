@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8
 
+from l2dgs_jax.data.color import brightening_exponent
 from l2dgs_jax.preprocess.capture.frames import luma
 
 TARGET_MEAN = 0.4  # of the brightened copies
@@ -39,8 +40,8 @@ def tone_for(frames: Iterable[Float32[np.ndarray, "H W 3"]]) -> Tone:
     levels = [(float(np.quantile(grey, 0.99)), float(grey.mean())) for grey in greys]
     high, mean = np.median(levels, axis=0).tolist()
     gain = float(np.clip(0.95 / max(high, 1e-3), 1, LARGEST_GAIN))
-    exponent = np.log(TARGET_MEAN) / np.log(np.clip(gain * mean, 1e-3, TARGET_MEAN))
-    return Tone(gain, float(max(exponent, SMALLEST_EXPONENT)), SMOOTHING if mean < NOISY_BELOW else 0.0)
+    exponent = brightening_exponent(gain * mean, TARGET_MEAN)
+    return Tone(gain, max(exponent, SMALLEST_EXPONENT), SMOOTHING if mean < NOISY_BELOW else 0.0)
 
 
 def brighten(image: Float32[np.ndarray, "H W 3"], tone: Tone) -> UInt8[np.ndarray, "H W"]:

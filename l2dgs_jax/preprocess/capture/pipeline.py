@@ -105,7 +105,7 @@ def prepare(source: Path, output: Path, cfg: CaptureConfig, curve: Curve = brigh
             f"{source}: 0 of {pairs} pairs of frames show parallax, so the camera only turns or "
             f"sees a flat surface; expected a camera that moves through the scene: {ADVICE}"
         )
-    model = structure.reconstruct(workplace, len(names))
+    model = structure.reconstruct(workplace, len(names), cfg.camera_model)
 
     missing = report.reasons(workplace, names, model)
     header = images.read_header(workplace.frames / names[0])
@@ -139,7 +139,7 @@ def prepare(source: Path, output: Path, cfg: CaptureConfig, curve: Curve = brigh
 def _open_work(source: Path, output: Path, cfg: CaptureConfig) -> Path:
     """The folder of intermediate results; results of other settings or another source are deleted."""
     work = output.absolute().with_name(f"{output.absolute().name}.partial")
-    inside = source.iterdir() if source.is_dir() else ()
+    inside = filter(Path.is_file, source.iterdir()) if source.is_dir() else ()
     settings = json.dumps(
         {
             "source": str(source.absolute()),

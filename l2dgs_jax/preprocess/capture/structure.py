@@ -121,18 +121,19 @@ def count_pairs(workplace: Workplace) -> tuple[int, int]:
     return len(found), sum(kind not in flat for kind in found)
 
 
-def reconstruct(workplace: Workplace, count: int) -> Any:
+def reconstruct(workplace: Workplace, count: int, camera_model: CameraModel) -> Any:
     """Find poses and points.
 
     The first attempt keeps lens distortion at zero until the final bundle adjustment, because few frames determine it
     badly, which then harms all later ones. If too few of the `count` frames get a pose, a second attempt estimates
-    distortion from the start, and the better reconstruction is taken.
+    distortion from the start, if the camera model has any, and the better reconstruction is taken.
 
     Returns:
         The largest model, a `pycolmap.Reconstruction`; None if there is none.
     """
     first = _map(workplace, count, distorted=False)
-    if first is not None and first.num_reg_images() >= ENOUGH_FRAMES * count:
+    enough = first is not None and first.num_reg_images() >= ENOUGH_FRAMES * count
+    if enough or camera_model in ("SIMPLE_PINHOLE", "PINHOLE"):
         return first
     models = [model for model in (first, _map(workplace, count, distorted=True)) if model is not None]
     return max(models, key=_size, default=None)

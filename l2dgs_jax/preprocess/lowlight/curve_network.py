@@ -14,6 +14,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from l2dgs_jax.model.networks import apply_conv, init_conv
 from l2dgs_jax.training import optimizer
+from l2dgs_jax.training.losses import block_means
 from l2dgs_jax.types import Conv
 
 ITERATIONS = 10  # of the curve
@@ -116,7 +117,7 @@ def spatial_loss(dark: Float[Array, "B H W"], lightness: Float[Array, "B H W"]) 
     """
     mean = lambda image: image.mean((1, 2), keepdims=True)
     scale = jax.lax.stop_gradient(mean(dark) / jnp.maximum(mean(lightness), 1e-6))
-    return squared_steps(block_means(dark - scale * lightness)[..., None])
+    return squared_steps(block_means(dark - scale * lightness, BLOCK)[..., None])
 
 
 def smoothness_loss(curves: Float[Array, "B H W R"]) -> Scalar:
@@ -152,11 +153,3 @@ def train(
 def squared_steps(image: Float[Array, "B H W R"]) -> Scalar:
     """Mean squared difference from the neighbours: those in x plus those in y, each counted from both sides."""
     return 2 * (jnp.square(jnp.diff(image, axis=1)).mean() + jnp.square(jnp.diff(image, axis=2)).mean())
-
-
-def block_means(image: Float[Array, "B H W"]) -> Float[Array, "B h w"]:
-    """Means of blocks of `BLOCK` x `BLOCK` pixels; incomplete blocks are left out."""
-    batch, height, width = image.shape
-    rows, columns = height // BLOCK, width // BLOCK
-    whole = image[:, : rows * BLOCK, : columns * BLOCK]
-    return whole.reshape(batch, rows, BLOCK, columns, BLOCK).mean((2, 4))

@@ -15,6 +15,7 @@ from tqdm import tqdm
 from l2dgs_jax import metrics
 from l2dgs_jax.data.dataset import Dataset, Split
 from l2dgs_jax.data.images import to_bytes
+from l2dgs_jax.data.stacks import MappedArray, stacked
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.preprocess.lowlight import darkening, weights
 from l2dgs_jax.visualize.sheet import sheet
@@ -224,12 +225,13 @@ def _darkener(
 def _twin(split: Split, dark: list[Bytes], welllit: list[Bytes]) -> Split:
     if not dark:
         return split
-    return dataclasses.replace(split, images=_stack(dark), welllit=_stack(welllit))
+    in_file = isinstance(split.images, MappedArray)
+    return dataclasses.replace(split, images=_stack(dark, in_file), welllit=_stack(welllit, in_file))
 
 
-def _stack(pictures: list[Bytes]) -> Float16[np.ndarray, "F H W 3"]:
+def _stack(pictures: list[Bytes], in_file: bool) -> Float16[np.ndarray, "F H W 3"]:
     """Values in [0, 1] as half floats, like the frames of a data set."""
-    return np.stack([_floats(picture).astype(np.float16) for picture in pictures])
+    return stacked(map(_floats, pictures), (len(pictures), *pictures[0].shape), np.float16, in_file)
 
 
 def _floats(picture: Bytes) -> Float32[np.ndarray, "H W 3"]:

@@ -12,6 +12,7 @@ from jaxtyping import Bool, UInt8
 from tqdm import tqdm
 
 from l2dgs_jax.cameras.flow import brightened
+from l2dgs_jax.data.color import brightening_exponent
 from l2dgs_jax.data.dataset import Dataset, Original
 from l2dgs_jax.data.images import to_bytes, write_image
 from l2dgs_jax.data.lens import distorted
@@ -88,10 +89,10 @@ def preview(dataset: Dataset, masks: Bool[np.ndarray, "F H W"]) -> UInt8[np.ndar
         frames = np.flatnonzero(part)[np.argsort(cameras.time[part], kind="stable")]
         chosen += frames[np.unique(np.linspace(0, len(frames) - 1, PREVIEW_ROWS // 2).round().astype(int))].tolist()
 
-    exponent = np.log(PREVIEW_LEVEL) / np.log(np.clip(images[chosen].astype(np.float32).mean(), 1e-3, 0.99))
+    exponent = brightening_exponent(float(images[chosen].mean(dtype=np.float64)), PREVIEW_LEVEL)
     rows = []
     for frame, grey in zip(chosen, brightened(images[chosen]), strict=True):
-        bright = np.clip(images[frame].astype(np.float32), 0, 1) ** min(exponent, 1)
+        bright = np.clip(images[frame].astype(np.float32), 0, 1) ** exponent
         tinted = np.where(masks[frame][..., None], 0.5 * bright + (0.5, 0, 0), bright)
         pictures = [to_bytes(images[frame]), np.repeat(grey[..., None], 3, axis=-1), to_bytes(tinted)]
         kind = "held out" if held_out[frame] else "trained on"
