@@ -65,7 +65,8 @@ def counting_step(states, *_, **__):
 def test_the_commands_of_a_page_run(page, tmp_path_factory, tmp_path, monkeypatch):
     run = finished_run.folder(tmp_path_factory.getbasetemp() / "docs")
     monkeypatch.chdir(tmp_path)
-    write_nerfies(tmp_path / "SCENE", finished_run.FRAMES, finished_run.WIDTH, finished_run.HEIGHT, num_points=40)
+    size = 2 * finished_run.WIDTH, 2 * finished_run.HEIGHT  # enough for the pages' --downscale 4
+    write_nerfies(tmp_path / "SCENE", finished_run.FRAMES, *size, num_points=40)
     for name in ("RUN", "runs/demo"):
         shutil.copytree(run, name)
     monkeypatch.setattr(demo, "FOLDER", tmp_path / "SCENE")
