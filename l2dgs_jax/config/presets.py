@@ -1,8 +1,8 @@
 """The named presets; docs/record.md has the reasons for each setting of `default`, and the measurements.
 
-`paper` follows the text of the paper, `authors` the authors' released code. `default` has measured best;
-`fast` and `demo` are shorter, `best` is longer. `4dgs`, `enhance-4dgs`, `curve-4dgs` and `static` are baselines to
-compare `default` with, after those of the paper's Table 1, and take as many steps as it does.
+`paper` follows the text of the paper, `authors` the authors' released code. `default` has measured best; `fast` and
+`demo` are shorter, `best` is longer. `4dgs`, `enhance-4dgs`, `curve-4dgs` and `static` are baselines to compare
+`default` with, after those of the paper's Table 1, and take as many steps as it does.
 """
 
 import dataclasses

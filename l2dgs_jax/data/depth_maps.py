@@ -78,15 +78,22 @@ def agreement(depths: Float32[np.ndarray, "F H W"], cameras: Camera, points: Flo
 
     0 if there is nothing to compare. It is negative where inverse depth was given by mistake.
     """
-    height, width = depths.shape[1:]
     found = []
     for frame in range(0, len(depths), -(-len(depths) // SAMPLED_FRAMES)):
-        depth = depths[frame]
-        viewmat, K = (np.asarray(x[frame]) for x in (cameras.viewmat, cameras.K))
-        _, pixels, distances = points_inside(points, viewmat, K, (width, height))
-        columns, rows = pixels.astype(int).T
-        told = depth[rows, columns]
-        pairs = np.log(np.stack([told, distances])[:, told > 0])
+        pairs = np.log(at_points(depths[frame], points, *(np.asarray(x[frame]) for x in cameras[:2])))
         if pairs.shape[1] > 1 and pairs.std(1).all():
             found.append(np.corrcoef(pairs)[0, 1])
     return float(np.median(found)) if found else 0.0
+
+
+def at_points(
+    depth: Float[np.ndarray, "H W"],
+    points: Float[np.ndarray, "P 3"],
+    viewmat: Float[np.ndarray, "4 4"],
+    K: Float[np.ndarray, "3 3"],
+) -> Float[np.ndarray, "2 S"]:
+    """Given depth (0 where unknown) and the points' own, for those in view where it is known; occlusion is ignored."""
+    _, pixels, distances = points_inside(points, viewmat, K, depth.shape[::-1])
+    columns, rows = pixels.astype(int).T
+    told = depth[rows, columns]
+    return np.stack([told, distances])[:, told > 0]

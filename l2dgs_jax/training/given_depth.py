@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Float32, Int
 
-from l2dgs_jax.cameras.geometry import points_inside
+from l2dgs_jax.data.depth_maps import at_points
 
 MIN_ALPHA = 0.5  # accumulated opacity above which a pixel has a depth
 HUBER_DELTA = 0.02  # of the mean inverse depth: differences below it count quadratically, above it linearly
@@ -82,14 +82,10 @@ def in_world_units(
     Returns:
         Depth in world units, NaN where unknown, and everywhere if too few points are in view or agree with it.
     """
-    height, width = given.shape
-    _, pixels, distances = points_inside(points, viewmat, K, (width, height))
-    columns, rows = pixels.astype(int).T
-    told = given[rows, columns]
-    if (told > 0).sum() < MIN_POINTS:
+    told, target = 1 / at_points(given, points, viewmat, K).astype(np.float64)
+    if len(told) < MIN_POINTS:
         return np.full(given.shape, np.nan)
-    terms = np.stack([1 / told[told > 0], np.ones((told > 0).sum())], axis=-1).astype(np.float64)
-    target = 1 / distances[told > 0]
+    terms = np.stack([told, np.ones(len(told))], axis=-1)
     weights = np.ones(len(target))
     for _ in range(FIT_ITERATIONS):
         (scale, shift), *_ = np.linalg.lstsq(weights[:, None] * terms, weights * target)
