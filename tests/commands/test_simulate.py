@@ -58,7 +58,7 @@ def refuses(capsys, tmp_path):
     return check
 
 
-@pytest.mark.parametrize("method", ["network", "analytic"])
+@pytest.mark.parametrize("method", ["network", "analytic", "camera"])
 def test_the_twin_is_the_same_scene_in_the_dark(scene, tmp_path, capsys, method):
     run(scene, tmp_path / "twin", "--method", method, "--exposure", 0.06)
     source, twin = load_dataset(scene), load_dataset(tmp_path / "twin")

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from skimage.color import rgb2lab
 
+from l2dgs_jax.data.color import srgb_to_linear
 from l2dgs_jax.preprocess.lowlight import darkening
 
 
@@ -99,3 +100,16 @@ def test_sensor_noise_has_the_moments_of_photons_and_read_out():
     black = darkening.add_sensor_noise(np.zeros((50, 50, 3), np.float32), (0,), photons, read_noise)
     assert black.min() == 0
     assert black.max() > 0
+
+
+def test_less_light_brings_pixels_to_the_exposure_and_keeps_the_ratios_of_their_channels():
+    pixels = picture(high=0.9).reshape(-1, 1, 3)
+    dark = darkening.scale_light(pixels, darkening.light_factor(pixels, 0.1))
+    np.testing.assert_allclose(darkening.lightness(dark).mean(), 0.1, atol=1e-4)
+    linear, bright = srgb_to_linear(dark), srgb_to_linear(pixels)
+    np.testing.assert_allclose(linear / linear.sum(), bright / bright.sum(), atol=1e-6)
+
+
+def test_less_light_leaves_dark_and_saturated_pixels_unchanged():
+    assert darkening.light_factor(picture(high=0.05).reshape(-1, 1, 3), 0.1) == 1
+    assert darkening.light_factor(np.ones((5, 1, 3), np.float32), 0.1) == 1

@@ -1,7 +1,8 @@
-"""Low-light pictures from well-lit ones, as LEDNet's pipeline makes them (arXiv 2202.03373).
+"""Low-light pictures from well-lit ones, as a camera or LEDNet's pipeline makes them (arXiv 2202.03373).
 
-A darkener turns the lightness of a picture into that of its dark twin, given the target exposure of every pixel. The
-ratio of the two lightnesses then scales all three channels, and the result is truncated to 8 bits.
+A camera scales linear light. In LEDNet's pipeline, a darkener turns the lightness of a picture into that of its dark
+twin, given the target exposure of every pixel. The ratio of the two lightnesses then scales all three channels, and the
+result is truncated to 8 bits.
 """
 
 from collections.abc import Callable
@@ -12,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
+from scipy.optimize import brentq
 
 from l2dgs_jax.data.color import linear_to_srgb, srgb_to_linear
 from l2dgs_jax.preprocess.lowlight import curve_network
@@ -83,6 +85,18 @@ def analytic_darkener(sample: Float32[np.ndarray, " N"], exposure: float) -> Dar
     rest = sample[~saturated(sample)]
     scale = np.float32(min(exposure / max(float(rest.mean(dtype=np.float64)), 1e-6), 1)) if rest.size else np.float32(1)
     return lambda light, _: scale * light + (1 - scale) * light**HIGHLIGHT_POWER
+
+
+def light_factor(pixels: Float32[np.ndarray, "P 1 3"], exposure: float, order: LabOrder = "correct") -> float:
+    """The factor on light by which pixels, sRGB in [0, 1], come to the mean lightness `exposure`; 1 if they are darker.
+
+    Saturated pixels do not count.
+    """
+    pixels = pixels[~saturated(lightness(pixels, order))[:, 0]]
+    excess = lambda factor: float(lightness(scale_light(pixels, factor), order).mean(dtype=np.float64)) - exposure
+    if not len(pixels) or excess(1.0) <= 0:
+        return 1.0
+    return float(brentq(excess, 0.0, 1.0, xtol=1e-6))
 
 
 def scale_light(image: Image, factor: float) -> Image:

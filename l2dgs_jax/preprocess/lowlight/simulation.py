@@ -1,6 +1,7 @@
 """Low-light twins of well-lit scenes, with the scenes themselves as ground truth."""
 
 import dataclasses
+import functools
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -21,11 +22,12 @@ from l2dgs_jax.preprocess.lowlight import darkening, weights
 from l2dgs_jax.visualize.sheet import sheet
 
 Bytes = UInt8[np.ndarray, "H W 3"]
+Image = Float32[np.ndarray, "H W 3"]
 
 
 MAX_ELECTRONS = 1e9
 DRIFT_PERIODS = 1.5  # of the wave by which exposure drifts, over the whole video
-SAMPLED_PIXELS = 1_000_000  # of a video, that the analytic curve is fitted to
+SAMPLED_PIXELS = 1_000_000  # of a video, that its darkening is fitted to
 
 
 @dataclass(frozen=True)
@@ -33,8 +35,8 @@ class DarkeningConfig:
     """How a scene is darkened.
 
     Attributes:
-        method: "analytic", one curve for the whole video, or "network", curves from a network that sees every pixel's
-            neighbourhood.
+        method: "analytic", one curve for the whole video; "network", curves from a network that sees every pixel's
+            neighbourhood; or "camera", less light on the sensor.
         weights: file with the network's weights: LEDNet's ce_zerodce.pth or an .npz of
             experiments.makers.train_darkener; if not given, those of this package.
         exposure: mean lightness of the dark frames, not counting saturated pixels; drawn from the range if not given.
@@ -50,7 +52,7 @@ class DarkeningConfig:
         seed: seed of exposures and noise.
     """
 
-    method: Literal["analytic", "network"] = "analytic"
+    method: Literal["analytic", "network", "camera"] = "analytic"
     weights: Path | None = None
     exposure: float | None = None
     exposure_range: tuple[float, float] = (0.05, 0.08)
@@ -118,13 +120,12 @@ def darken(dataset: Dataset, cfg: DarkeningConfig) -> tuple[Dataset, dict[str, F
     names = dataset.train.names + dataset.test.names
     pictures = [to_bytes(picture) for picture in _sources(dataset)]
     exposures, lights = _exposures(len(names), cfg), _lights(dataset, cfg)
-    darkener = _darkener(pictures, _counted(dataset), exposures, dataset.name, cfg)
+    darkened = _darkened(pictures, _counted(dataset), exposures, dataset.name, cfg)
     frames: dict[str, FrameReport] = {}
     dark: list[Bytes] = []
     for i, name in enumerate(tqdm(names, desc="darken", unit="frame", dynamic_ncols=True)):
         image = _floats(pictures[i])
-        low = darkening.darken(image, exposures[i], darkener(i), cfg.lab_order, cfg.allow_brightening)
-        low = darkening.scale_light(low, lights[i])
+        low = darkening.scale_light(darkened(i), lights[i])
         if cfg.photons is not None:
             low = darkening.add_sensor_noise(low, (cfg.seed, i), cfg.photons, cfg.read_noise)
         dark.append(darkening.truncate(low))
@@ -190,36 +191,45 @@ def _lights(dataset: Dataset, cfg: DarkeningConfig) -> list[float]:
     return (1 + cfg.exposure_drift * np.sin(2 * np.pi * (begin + DRIFT_PERIODS * times))).tolist()
 
 
-def _darkener(
+def _darkened(
     pictures: Sequence[Bytes],
     counted: Sequence[Bool[np.ndarray, "H W"]],
     exposures: Sequence[float],
     name: str,
     cfg: DarkeningConfig,
-) -> Callable[[int], darkening.Darkener]:
-    """A function that gives the darkener of each frame, by index; analytic ones are fitted to the pixels that count.
+) -> Callable[[int], Image]:
+    """A function that darkens each frame, by index; what is fitted is fitted to the pixels that count.
 
     Raises:
         UserError: the pictures are not brighter than the exposure, or the weights cannot be read.
     """
 
-    def light(i: int) -> Float32[np.ndarray, " P"]:
-        return darkening.lightness(_floats(pictures[i]), cfg.lab_order)[counted[i]]
+    def pixels(i: int) -> Float32[np.ndarray, "P 1 3"]:
+        return _floats(pictures[i])[counted[i]][:, None]
+
+    def light(pixels: Float32[np.ndarray, "P 1 3"]) -> Float32[np.ndarray, " P"]:
+        return darkening.lightness(pixels, cfg.lab_order)[:, 0]
+
+    def by_lightness(i: int, darkener: darkening.Darkener) -> Image:
+        return darkening.darken(_floats(pictures[i]), exposures[i], darkener, cfg.lab_order, cfg.allow_brightening)
 
     stride = -(-sum(picture.size // 3 for picture in pictures) // SAMPLED_PIXELS)
-    sample = np.concatenate([light(i)[::stride] for i in range(len(pictures))])
-    if sample.mean() <= darkening.exposure_map(sample, min(exposures)).mean():
+    sample = np.concatenate([pixels(i)[::stride] for i in range(len(pictures))])
+    level, expected = light(sample).mean(), darkening.exposure_map(light(sample), min(exposures)).mean()
+    if level <= expected:
         raise UserError(
-            f"{name}: the mean lightness of its pictures is {sample.mean():.3f}; "
+            f"{name}: the mean lightness of its pictures is {level:.3f}; "
             f"expected brighter ones than the exposure, {min(exposures):.3f}, or a lower --exposure"
         )
+    fitted_to = pixels if cfg.per_image else lambda _: sample
     if cfg.method == "network":
         network = darkening.network_darkener(weights.load(cfg.weights or weights.SHIPPED))
-        return lambda _: network
-    if cfg.per_image:
-        return lambda i: darkening.analytic_darkener(light(i), exposures[i])
-    analytic = darkening.analytic_darkener(sample, exposures[0])
-    return lambda _: analytic
+        return lambda i: by_lightness(i, network)
+    if cfg.method == "camera":
+        factor = functools.cache(lambda i: darkening.light_factor(fitted_to(i), exposures[i], cfg.lab_order))
+        return lambda i: darkening.scale_light(_floats(pictures[i]), factor(i if cfg.per_image else 0))
+    analytic = functools.cache(lambda i: darkening.analytic_darkener(light(fitted_to(i)), exposures[i]))
+    return lambda i: by_lightness(i, analytic(i if cfg.per_image else 0))
 
 
 def _twin(split: Split, dark: list[Bytes], welllit: list[Bytes]) -> Split:
@@ -234,7 +244,7 @@ def _stack(pictures: list[Bytes], in_file: bool) -> Float16[np.ndarray, "F H W 3
     return stacked(map(_floats, pictures), (len(pictures), *pictures[0].shape), np.float16, in_file)
 
 
-def _floats(picture: Bytes) -> Float32[np.ndarray, "H W 3"]:
+def _floats(picture: Bytes) -> Image:
     return picture.astype(np.float32) / 255
 
 

@@ -1,0 +1,268 @@
+"""Path-trace a scene whose truth is known: `python -m experiments.makers.make_walk OUTPUT [--frames N]`.
+
+Somebody walks through a yard in which a ball rolls, before a hand-held camera; a second camera, beside it, is held out.
+The scene has the layout of Nerfies, with masks of what moves and points on static surfaces, as structure from motion
+finds them. It is well lit: `python -m l2dgs_jax.simulate` makes it dark.
+
+Needs Mitsuba 3 (`pip install mitsuba`). `--variant llvm_ad_rgb` takes half the time, and LLVM 17 or newer.
+"""
+
+import argparse
+import itertools
+from pathlib import Path
+from typing import Any
+
+import cv2
+import mitsuba as mi
+import numpy as np
+from jaxtyping import Bool, Float64
+from tqdm import tqdm
+
+from l2dgs_jax.data.images import to_bytes, write_image
+from l2dgs_jax.runtime.files import new_folder, write_json
+
+WIDTH, HEIGHT, FOCAL = 400, 225, 400.0  # pixels
+SAMPLES = 128  # a pixel
+BASELINE = 0.5  # metres between the two cameras
+EVERY = 3  # the held-out camera sees every third instant
+POINTS, POINT_NOISE = 4000, 0.003  # the noise is a fraction of the distance
+
+START, END, LANE = -1.5, 1.3, 0.3  # the walk leads along x, at this y
+STRIDE = 1.3  # metres that a step of both legs covers
+BALL = 0.17  # its radius
+
+Vector = Float64[np.ndarray, "3"]
+Image = Float64[np.ndarray, "H W 3"]
+Parts = dict[str, dict[str, Any]]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("output", type=Path)
+    parser.add_argument("--frames", type=int, default=48)
+    parser.add_argument("--variant", default="scalar_rgb", choices=mi.variants())
+    options = parser.parse_args()
+    mi.set_variant(options.variant)
+    with new_folder(options.output) as folder:
+        make(folder, options.frames)
+
+
+def make(folder: Path, frames: int) -> None:
+    """Write the scene."""
+    for part in ("rgb/1x", "mask/1x", "camera"):
+        (folder / part).mkdir(parents=True)
+    views, points = {}, []
+    rng = np.random.default_rng(0)
+    for i in tqdm(range(frames)):
+        time = i / (frames - 1)
+        static = yard()
+        scenes = [mi.load_dict({"type": "scene"} | parts) for parts in (static, static | walker(time) | ball(time))]
+        for name, offset in ((f"{i:06d}", 0.0), (f"{i:06d}_r", BASELINE))[: 1 + (i % EVERY == 0)]:
+            position, rotation = camera(time, offset)
+            image = render(scenes[1], position, rotation, {"type": "path", "max_depth": 6}, SAMPLES)
+            behind, seen = (render(x, position, rotation, {"type": "aov", "aovs": "p:position"}, 1) for x in scenes)
+            moves = (behind != seen).any(-1)
+            write_image(folder / "rgb" / "1x" / f"{name}.png", to_bytes(srgb(image)))
+            write_image(
+                folder / "mask" / "1x" / f"{name}.png", np.repeat(255 * moves[..., None].astype(np.uint8), 3, -1)
+            )
+            write_json(folder / "camera" / f"{name}.json", camera_file(position, rotation))
+            views[name] = {"camera_id": int(offset > 0), "warp_id": i, "appearance_id": i, "time_id": i}
+            if not offset:
+                points.append(corners(image, seen, moves, position, -(-POINTS // frames), rng))
+    train = [name for name in views if not name.endswith("_r")]
+    test = [name for name in views if name.endswith("_r")]
+    lists = {"count": len(views), "num_exemplars": len(train), "ids": list(views)}
+    write_json(folder / "dataset.json", lists | {"train_ids": train, "val_ids": test})
+    write_json(folder / "metadata.json", views)
+    write_json(folder / "scene.json", {"scale": 1.0, "center": [0.0] * 3, "near": 1.0, "far": 12.0})
+    np.save(folder / "points.npy", np.concatenate(points).astype(np.float32))
+
+
+def camera(time: float, offset: float) -> tuple[Vector, Float64[np.ndarray, "3 3"]]:
+    """Position and axes, in rows, of the filming camera, or of one `offset` metres to its right that sees the same."""
+    shake = 0.02 * np.array([np.sin(41 * time), np.sin(29 * time + 1), np.sin(53 * time + 2)])
+    position = np.array([-0.7 + 1.1 * time, -4.2 + 0.5 * np.sin(3 * time), 1.65]) + shake
+    target = np.array([0.3 * time, 0.6, 0.63]) + shake[::-1]
+    position = position + offset * _axes(target - position)[0]
+    return position, _axes(target - position)
+
+
+def _axes(forward: Vector) -> Float64[np.ndarray, "3 3"]:
+    """Right, down and forward of a camera that is held upright."""
+    forward = forward / np.linalg.norm(forward)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(forward, right), forward])
+
+
+def camera_file(position: Vector, rotation: Float64[np.ndarray, "3 3"]) -> dict[str, Any]:
+    """A camera of the Nerfies layout."""
+    return {
+        "orientation": rotation.tolist(),
+        "position": position.tolist(),
+        "focal_length": FOCAL,
+        "principal_point": [WIDTH / 2, HEIGHT / 2],
+        "skew": 0.0,
+        "pixel_aspect_ratio": 1.0,
+        "radial_distortion": [0.0] * 3,
+        "tangential_distortion": [0.0] * 2,
+        "image_size": [WIDTH, HEIGHT],
+    }
+
+
+def render(
+    scene: Any, position: Vector, rotation: Float64[np.ndarray, "3 3"], integrator: dict[str, Any], samples: int
+) -> Image:
+    """What an integrator finds at each pixel; the same pixels' rays in every scene."""
+    film = {"type": "hdrfilm", "width": WIDTH, "height": HEIGHT, "rfilter": {"type": "box"}}
+    sensor = {
+        "type": "perspective",
+        "fov": float(np.degrees(2 * np.arctan(WIDTH / 2 / FOCAL))),
+        "to_world": mi.ScalarTransform4f().look_at(position, position + rotation[2], [0, 0, 1]),
+        "film": film,
+    }
+    picture = mi.render(scene, sensor=mi.load_dict(sensor), integrator=mi.load_dict(integrator), spp=samples)
+    return np.asarray(picture, np.float64)[..., :3]
+
+
+def srgb(linear: Image) -> Image:
+    """Linear light to sRGB values in [0, 1]."""
+    linear = np.clip(linear, 0, 1)
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+
+
+def corners(
+    image: Image, hits: Image, moves: Bool[np.ndarray, "H W"], position: Vector, count: int, rng: np.random.Generator
+) -> Float64[np.ndarray, "N 3"]:
+    """Points that a camera sees on static surfaces, the more where there is texture, off along their rays."""
+    grey = srgb(image).mean(-1)
+    texture = np.hypot(cv2.Sobel(grey, -1, 1, 0), cv2.Sobel(grey, -1, 0, 1))
+    texture[moves | (hits == 0).all(-1)] = 0
+    chosen = rng.choice(texture.size, count, replace=False, p=(texture / texture.sum()).ravel())
+    noise = 1 + POINT_NOISE * rng.standard_normal((count, 1))
+    return position + noise * (hits.reshape(-1, 3)[chosen] - position)
+
+
+def paint(seed: int, low: list[float], high: list[float], cells: tuple[int, int] = (8, 8)) -> dict[str, Any]:
+    """A matt surface between two colours: patches of the given number, in finer and finer detail."""
+    rng = np.random.default_rng(seed)
+    size = (256, 256)
+    layers = [
+        cv2.resize(rng.uniform(size=(2**k * cells[1], 2**k * cells[0])), size, interpolation=cv2.INTER_NEAREST)
+        for k in range(4)
+    ]
+    mix = np.average(layers, axis=0, weights=[4, 2, 1, 1])[..., None]
+    mix = np.clip(0.5 + 2 * (mix - 0.5), 0, 1)
+    bitmap = mi.Bitmap((mix * np.array(high) + (1 - mix) * np.array(low)).astype(np.float32))
+    return {"type": "diffuse", "reflectance": {"type": "bitmap", "bitmap": bitmap, "raw": True}}
+
+
+def yard() -> Parts:
+    """What stands still, and the lights."""
+    T = mi.ScalarTransform4f
+    ground, bricks = (
+        paint(1, [0.16, 0.15, 0.13], [0.5, 0.47, 0.42], (20, 20)),
+        paint(2, [0.25, 0.1, 0.07], [0.62, 0.4, 0.3], (16, 24)),
+    )
+    wood, metal, plant = (
+        paint(3, [0.2, 0.12, 0.05], [0.55, 0.38, 0.2], (3, 10)),
+        paint(4, [0.1, 0.2, 0.3], [0.3, 0.5, 0.65]),
+        paint(5, [0.05, 0.15, 0.04], [0.3, 0.55, 0.2]),
+    )
+    parts: Parts = {
+        "ground": {"type": "rectangle", "to_world": T().scale([7, 7, 1]), "bsdf": ground},
+        "wall": {
+            "type": "rectangle",
+            "to_world": T().translate([0, 2.6, 1.2]).rotate([1, 0, 0], 90).scale([7, 2.2, 1]),
+            "bsdf": bricks,
+        },
+        "side": {
+            "type": "rectangle",
+            "to_world": T().translate([-3.4, 0, 1.2]).rotate([0, 1, 0], 90).scale([2.2, 7, 1]),
+            "bsdf": paint(6, [0.5, 0.45, 0.3], [0.75, 0.7, 0.55]),
+        },
+        "door": {"type": "cube", "to_world": T().translate([1.5, 2.58, 1]).scale([0.5, 0.05, 1]), "bsdf": wood},
+        "barrel": {"type": "cylinder", "p0": [-1.9, 1.5, 0], "p1": [-1.9, 1.5, 0.9], "radius": 0.33, "bsdf": metal},
+        "lid": {"type": "disk", "to_world": T().translate([-1.9, 1.5, 0.9]).scale(0.33), "bsdf": wood},
+        "bush": {"type": "sphere", "center": [2.3, 1.6, 0.45], "radius": 0.5, "bsdf": plant},
+        "sky": {"type": "constant", "radiance": {"type": "rgb", "value": [0.5, 0.55, 0.68]}},
+        "lamp": {
+            "type": "sphere",
+            "center": [2.5, -2.5, 4.2],
+            "radius": 0.35,
+            "emitter": {"type": "area", "radiance": {"type": "rgb", "value": [40.0, 35.0, 27.0]}},
+        },
+    }
+    for k, (x, y, size, turn) in enumerate(
+        [
+            (-0.7, 1.7, 0.3, 20),
+            (-0.65, 1.75, 0.2, 50),
+            (0.5, 1.9, 0.35, -10),
+            (1.6, -1.2, 0.2, 35),
+            (-2.2, -0.9, 0.25, 15),
+        ]
+    ):
+        z = size if k != 1 else 0.8
+        parts[f"crate{k}"] = {
+            "type": "cube",
+            "to_world": T().translate([x, y, z]).rotate([0, 0, 1], turn).scale(size),
+            "bsdf": paint(10 + k, [0.3, 0.2, 0.1], [0.7, 0.55, 0.35]),
+        }
+    return parts
+
+
+def limb(name: str, joints: list[Vector], radius: float, bsdf: dict[str, Any]) -> Parts:
+    """Rounded rods from joint to joint."""
+    parts: Parts = {
+        f"{name}{i}": {"type": "sphere", "center": p, "radius": radius, "bsdf": bsdf} for i, p in enumerate(joints)
+    }
+    for i, (p, q) in enumerate(itertools.pairwise(joints)):
+        parts[f"{name}rod{i}"] = {"type": "cylinder", "p0": p, "p1": q, "radius": radius, "bsdf": bsdf}
+    return parts
+
+
+def walker(time: float) -> Parts:
+    """Somebody who swings arms and legs."""
+    shirt, trousers = (
+        paint(20, [0.6, 0.1, 0.1], [0.85, 0.6, 0.3], (6, 6)),
+        paint(21, [0.05, 0.07, 0.2], [0.2, 0.25, 0.5], (4, 8)),
+    )
+    skin, hair = paint(22, [0.6, 0.4, 0.3], [0.75, 0.55, 0.45], (3, 3)), paint(23, [0.1, 0.06, 0.03], [0.3, 0.2, 0.1])
+    x = START + (END - START) * time
+    phase = 2 * np.pi * (x - START) / STRIDE
+    hip = np.array([x, LANE, 0.92 + 0.02 * np.cos(2 * phase)])
+
+    def body(x: float, y: float, z: float) -> Vector:
+        return hip + np.array([x, y, z])
+
+    def reach(start: Vector, lengths: list[float], angles: list[float]) -> list[Vector]:
+        joints = [start]
+        for length, angle in zip(lengths, angles, strict=True):
+            joints.append(joints[-1] + length * np.array([np.sin(angle), 0.0, -np.cos(angle)]))
+        return joints
+
+    parts = limb("trunk", [body(0, 0, 0.05), body(0.02, 0, 0.45)], 0.17, shirt)
+    parts |= limb("head", [body(0.03, 0, 0.76)], 0.12, skin) | limb("hair", [body(0.0, 0, 0.81)], 0.115, hair)
+    for side, name in ((-1, "left"), (1, "right")):
+        thigh = 0.45 * side * np.sin(phase)
+        bend = 0.1 + 0.6 * max(0.0, side * np.cos(phase))
+        parts |= limb(f"{name}leg", reach(body(0, 0.1 * side, 0), [0.43, 0.42], [thigh, thigh - bend]), 0.075, trousers)
+        arm = -0.5 * side * np.sin(phase)
+        parts |= limb(f"{name}arm", reach(body(0, 0.24 * side, 0.46), [0.29, 0.27], [arm, arm + 0.5]), 0.055, shirt)
+    return parts
+
+
+def ball(time: float) -> Parts:
+    """A ball that rolls past in front."""
+    way, heading = 2.0 * time, np.array([np.cos(0.15), -np.sin(0.15), 0.0])
+    center = np.array([-0.8, -0.2, BALL]) + way * heading
+    axis = np.cross([0.0, 0.0, 1.0], heading)
+    turned = mi.ScalarTransform4f().translate(center).rotate(axis, np.degrees(way / BALL)).scale(BALL)
+    return {
+        "ball": {"type": "sphere", "to_world": turned, "bsdf": paint(30, [0.1, 0.3, 0.7], [0.95, 0.9, 0.2], (4, 3))}
+    }
+
+
+if __name__ == "__main__":
+    main()

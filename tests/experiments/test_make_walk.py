@@ -1,0 +1,49 @@
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from experiments.makers import make_walk
+from l2dgs_jax.cameras.geometry import project_points
+from l2dgs_jax.data import load_dataset
+
+FRAMES = 4
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    mi.set_variant("scalar_rgb")
+    folder = tmp_path_factory.mktemp("walk")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(make_walk, "SAMPLES", 1)
+        make_walk.make(folder, FRAMES)
+    return load_dataset(str(folder))
+
+
+def test_the_scene_is_read_with_the_second_camera_held_out(dataset):
+    assert dataset.train.names == ("000000", "000001", "000002", "000003")
+    assert dataset.test.names == ("000000_r", "000003_r")
+    apart = [make_walk.camera(0.0, offset)[0] for offset in (0.0, make_walk.BASELINE)]
+    np.testing.assert_allclose(np.linalg.norm(apart[1] - apart[0]), make_walk.BASELINE)
+
+
+@pytest.mark.parametrize("split", ["train", "test"])
+def test_masks_show_the_walker_where_the_cameras_see_him(dataset, split):
+    split = getattr(dataset, split)
+    for i, time in enumerate(split.cameras.time):
+        head = np.array(make_walk.walker(float(time))["head0"]["center"], np.float32)
+        pixels, _ = project_points(head[None], split.cameras.viewmat[i], split.cameras.K[i])
+        column, row = np.floor(pixels[0]).astype(int)
+        assert split.masks[i, row, column]
+        assert split.masks[i].mean() < 0.2
+
+
+def test_points_lie_on_what_stands_still(dataset):
+    masks, cameras = dataset.train.masks, dataset.train.cameras
+    per_frame = len(dataset.points) // FRAMES
+    for i in range(FRAMES):
+        points = dataset.points[i * per_frame : (i + 1) * per_frame]
+        pixels, depth = project_points(points, cameras.viewmat[i], cameras.K[i])
+        column, row = np.floor(pixels).astype(int).T
+        assert (depth > 1).all()
+        assert not masks[i, row.clip(0, masks.shape[1] - 1), column.clip(0, masks.shape[2] - 1)].any()
+    assert dataset.points[:, 2].min() > -0.1  # nothing is below the ground
