@@ -9,6 +9,7 @@ Needs Mitsuba 3 (`pip install mitsuba`). `--variant llvm_ad_rgb` takes half the 
 
 import argparse
 import itertools
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,8 @@ POINTS, POINT_NOISE = 4000, 0.003  # the noise is a fraction of the distance
 
 START, END, LANE = -1.5, 1.3, 0.3  # the walk leads along x, at this y
 STRIDE = 1.3  # metres that a step of both legs covers
+LEG, LEG_RADIUS = (0.43, 0.42), 0.075  # lengths from hip to knee and to ankle
+SIDES = {-1: "left", 1: "right"}
 BALL = 0.17  # its radius
 
 Vector = Float64[np.ndarray, "3"]
@@ -212,7 +215,7 @@ def yard() -> Parts:
     return parts
 
 
-def limb(name: str, joints: list[Vector], radius: float, bsdf: dict[str, Any]) -> Parts:
+def limb(name: str, joints: Sequence[Vector], radius: float, bsdf: dict[str, Any]) -> Parts:
     """Rounded rods from joint to joint."""
     parts: Parts = {
         f"{name}{i}": {"type": "sphere", "center": p, "radius": radius, "bsdf": bsdf} for i, p in enumerate(joints)
@@ -223,7 +226,7 @@ def limb(name: str, joints: list[Vector], radius: float, bsdf: dict[str, Any]) -
 
 
 def walker(time: float) -> Parts:
-    """Somebody who swings arms and legs."""
+    """Somebody who swings arms and legs, one foot on the ground."""
     shirt, trousers = (
         paint(20, [0.6, 0.1, 0.1], [0.85, 0.6, 0.3], (6, 6)),
         paint(21, [0.05, 0.07, 0.2], [0.2, 0.25, 0.5], (4, 8)),
@@ -231,23 +234,25 @@ def walker(time: float) -> Parts:
     skin, hair = paint(22, [0.6, 0.4, 0.3], [0.75, 0.55, 0.45], (3, 3)), paint(23, [0.1, 0.06, 0.03], [0.3, 0.2, 0.1])
     x = START + (END - START) * time
     phase = 2 * np.pi * (x - START) / STRIDE
-    hip = np.array([x, LANE, 0.92 + 0.02 * np.cos(2 * phase)])
+    legs = {}
+    for side in SIDES:
+        thigh = 0.45 * side * np.sin(phase)
+        legs[side] = [thigh, thigh - 0.1 - 0.6 * max(0.0, side * np.cos(phase))]
+    hip = np.array([x, LANE, LEG_RADIUS + max(np.dot(LEG, np.cos(angles)) for angles in legs.values())])
 
     def body(x: float, y: float, z: float) -> Vector:
         return hip + np.array([x, y, z])
 
-    def reach(start: Vector, lengths: list[float], angles: list[float]) -> list[Vector]:
+    def reach(start: Vector, lengths: Sequence[float], angles: Sequence[float]) -> list[Vector]:
         joints = [start]
         for length, angle in zip(lengths, angles, strict=True):
             joints.append(joints[-1] + length * np.array([np.sin(angle), 0.0, -np.cos(angle)]))
         return joints
 
     parts = limb("trunk", [body(0, 0, 0.05), body(0.02, 0, 0.45)], 0.17, shirt)
-    parts |= limb("head", [body(0.03, 0, 0.76)], 0.12, skin) | limb("hair", [body(0.0, 0, 0.81)], 0.115, hair)
-    for side, name in ((-1, "left"), (1, "right")):
-        thigh = 0.45 * side * np.sin(phase)
-        bend = 0.1 + 0.6 * max(0.0, side * np.cos(phase))
-        parts |= limb(f"{name}leg", reach(body(0, 0.1 * side, 0), [0.43, 0.42], [thigh, thigh - bend]), 0.075, trousers)
+    parts |= limb("head", [body(0.03, 0, 0.76)], 0.12, skin) | limb("hair", [body(0, 0, 0.81)], 0.115, hair)
+    for side, name in SIDES.items():
+        parts |= limb(f"{name}leg", reach(body(0, 0.1 * side, 0), LEG, legs[side]), LEG_RADIUS, trousers)
         arm = -0.5 * side * np.sin(phase)
         parts |= limb(f"{name}arm", reach(body(0, 0.24 * side, 0.46), [0.29, 0.27], [arm, arm + 0.5]), 0.055, shirt)
     return parts

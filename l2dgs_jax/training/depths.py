@@ -21,7 +21,7 @@ NEIGHBOUR_RADIUS = 9.0  # pixels within which tracks may belong to one object
 VELOCITY_SIGMA = 0.3  # standard deviation, in pixels per frame, of velocities within one object
 ALIKE = 0.5  # similarity of motion from which neighbours belong to one object
 COLUMNS = 6  # pixels to either side of an observation in which what its object hides counts at least
-COLUMNS_PER_HEIGHT = 0.2  # as many as this times the height of the object
+COLUMNS_PER_HEIGHT = 0.15  # as many as this times the height of the object
 ON_GROUND = 0.8  # a surface is taken for the ground from this share of the depth at which the ground would be seen
 # Weights of squared differences of log-distances; the absolute error of the guess counts `TYPICAL_ERROR` times
 NEIGHBOUR_WEIGHT = 1.0  # between neighbours, times the similarity of their motion
@@ -104,7 +104,7 @@ def shared_depths(
     alike = similarity > ALIKE
     per_depth = np.concatenate(horizontal)
     of_ground = np.concatenate(ground)
-    behind = np.fmin(np.concatenate([depths_at(track, hidden) for track in tracks]), of_ground)
+    behind = np.concatenate([depths_at(track, hidden) for track in tracks])
     nearest = _nearest_hidden(merged, per_depth * behind, first[alike], second[alike])
     told = per_depth * np.concatenate(given)
     is_told = np.isfinite(told)
