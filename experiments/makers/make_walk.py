@@ -33,6 +33,13 @@ STRIDE = 1.3  # metres that a step of both legs covers
 LEG, LEG_RADIUS = (0.43, 0.42), 0.075  # lengths from hip to knee and to ankle
 SIDES = {-1: "left", 1: "right"}
 BALL = 0.17  # its radius
+CRATES = (  # x, y and z of the centre, half the side, degrees
+    (-0.7, 1.7, 0.3, 0.3, 20),
+    (-0.65, 1.75, 0.8, 0.2, 50),
+    (0.5, 1.9, 0.35, 0.35, -10),
+    (1.6, -1.2, 0.2, 0.2, 35),
+    (-2.2, -0.9, 0.25, 0.25, 15),
+)
 
 Vector = Float64[np.ndarray, "3"]
 Image = Float64[np.ndarray, "H W 3"]
@@ -66,9 +73,7 @@ def make(folder: Path, frames: int) -> None:
             behind, seen = (render(x, position, rotation, {"type": "aov", "aovs": "p:position"}, 1) for x in scenes)
             moves = (behind != seen).any(-1)
             write_image(folder / "rgb" / "1x" / f"{name}.png", to_bytes(srgb(image)))
-            write_image(
-                folder / "mask" / "1x" / f"{name}.png", np.repeat(255 * moves[..., None].astype(np.uint8), 3, -1)
-            )
+            write_image(folder / "mask" / "1x" / f"{name}.png", np.tile(np.uint8(255) * moves[..., None], 3))
             write_json(folder / "camera" / f"{name}.json", camera_file(position, rotation))
             views[name] = {"camera_id": int(offset > 0), "warp_id": i, "appearance_id": i, "time_id": i}
             if not offset:
@@ -164,15 +169,11 @@ def paint(seed: int, low: list[float], high: list[float], cells: tuple[int, int]
 def yard() -> Parts:
     """What stands still, and the lights."""
     T = mi.ScalarTransform4f
-    ground, bricks = (
-        paint(1, [0.16, 0.15, 0.13], [0.5, 0.47, 0.42], (20, 20)),
-        paint(2, [0.25, 0.1, 0.07], [0.62, 0.4, 0.3], (16, 24)),
-    )
-    wood, metal, plant = (
-        paint(3, [0.2, 0.12, 0.05], [0.55, 0.38, 0.2], (3, 10)),
-        paint(4, [0.1, 0.2, 0.3], [0.3, 0.5, 0.65]),
-        paint(5, [0.05, 0.15, 0.04], [0.3, 0.55, 0.2]),
-    )
+    ground = paint(1, [0.16, 0.15, 0.13], [0.5, 0.47, 0.42], (20, 20))
+    bricks = paint(2, [0.25, 0.1, 0.07], [0.62, 0.4, 0.3], (16, 24))
+    wood = paint(3, [0.2, 0.12, 0.05], [0.55, 0.38, 0.2], (3, 10))
+    metal = paint(4, [0.1, 0.2, 0.3], [0.3, 0.5, 0.65])
+    plant = paint(5, [0.05, 0.15, 0.04], [0.3, 0.55, 0.2])
     parts: Parts = {
         "ground": {"type": "rectangle", "to_world": T().scale([7, 7, 1]), "bsdf": ground},
         "wall": {
@@ -197,16 +198,7 @@ def yard() -> Parts:
             "emitter": {"type": "area", "radiance": {"type": "rgb", "value": [40.0, 35.0, 27.0]}},
         },
     }
-    for k, (x, y, size, turn) in enumerate(
-        [
-            (-0.7, 1.7, 0.3, 20),
-            (-0.65, 1.75, 0.2, 50),
-            (0.5, 1.9, 0.35, -10),
-            (1.6, -1.2, 0.2, 35),
-            (-2.2, -0.9, 0.25, 15),
-        ]
-    ):
-        z = size if k != 1 else 0.8
+    for k, (x, y, z, size, turn) in enumerate(CRATES):
         parts[f"crate{k}"] = {
             "type": "cube",
             "to_world": T().translate([x, y, z]).rotate([0, 0, 1], turn).scale(size),
@@ -227,11 +219,10 @@ def limb(name: str, joints: Sequence[Vector], radius: float, bsdf: dict[str, Any
 
 def walker(time: float) -> Parts:
     """Somebody who swings arms and legs, one foot on the ground."""
-    shirt, trousers = (
-        paint(20, [0.6, 0.1, 0.1], [0.85, 0.6, 0.3], (6, 6)),
-        paint(21, [0.05, 0.07, 0.2], [0.2, 0.25, 0.5], (4, 8)),
-    )
-    skin, hair = paint(22, [0.6, 0.4, 0.3], [0.75, 0.55, 0.45], (3, 3)), paint(23, [0.1, 0.06, 0.03], [0.3, 0.2, 0.1])
+    shirt = paint(20, [0.6, 0.1, 0.1], [0.85, 0.6, 0.3], (6, 6))
+    trousers = paint(21, [0.05, 0.07, 0.2], [0.2, 0.25, 0.5], (4, 8))
+    skin = paint(22, [0.6, 0.4, 0.3], [0.75, 0.55, 0.45], (3, 3))
+    hair = paint(23, [0.1, 0.06, 0.03], [0.3, 0.2, 0.1])
     x = START + (END - START) * time
     phase = 2 * np.pi * (x - START) / STRIDE
     legs = {}
