@@ -19,8 +19,11 @@ import numpy as np
 from jaxtyping import Bool, Float64
 from tqdm import tqdm
 
-from l2dgs_jax.data.images import to_bytes, write_image
-from l2dgs_jax.runtime.files import new_folder, write_json
+from l2dgs_jax.data import nerfies
+from l2dgs_jax.data.color import linear_to_srgb
+from l2dgs_jax.data.dataset import Dataset, Split
+from l2dgs_jax.runtime.files import new_folder
+from l2dgs_jax.types import Camera
 
 WIDTH, HEIGHT, FOCAL = 400, 225, 400.0  # pixels
 SAMPLES = 128  # a pixel
@@ -43,6 +46,7 @@ CRATES = (  # x, y and z of the centre, half the side, degrees
 
 Vector = Float64[np.ndarray, "3"]
 Image = Float64[np.ndarray, "H W 3"]
+Mask = Bool[np.ndarray, "H W"]
 Parts = dict[str, dict[str, Any]]
 
 
@@ -53,38 +57,39 @@ def main() -> None:
     parser.add_argument("--variant", default="scalar_rgb", choices=mi.variants())
     options = parser.parse_args()
     mi.set_variant(options.variant)
-    with new_folder(options.output) as folder:
-        make(folder, options.frames)
+    with new_folder(options.output) as folder:  # which refuses before it takes minutes, not after
+        nerfies.write(make(options.frames), folder)
 
 
-def make(folder: Path, frames: int) -> None:
-    """Write the scene."""
-    for part in ("rgb/1x", "mask/1x", "camera"):
-        (folder / part).mkdir(parents=True)
-    views, points = {}, []
+def make(frames: int) -> Dataset:
+    """The scene, well lit."""
     rng = np.random.default_rng(0)
-    for i in tqdm(range(frames)):
-        time = i / (frames - 1)
-        static = yard()
+    points = []
+    views: dict[float, list[tuple[str, Camera, Image, Mask]]] = {0.0: [], BASELINE: []}  # by the camera's offset
+    static = yard()
+    for i, time in enumerate(tqdm(np.linspace(0, 1, frames))):
         scenes = [mi.load_dict({"type": "scene"} | parts) for parts in (static, static | walker(time) | ball(time))]
-        for name, offset in ((f"{i:06d}", 0.0), (f"{i:06d}_r", BASELINE))[: 1 + (i % EVERY == 0)]:
+        for offset, seen in views.items():
+            if offset and i % EVERY:
+                continue
             position, rotation = camera(time, offset)
             image = render(scenes[1], position, rotation, {"type": "path", "max_depth": 6}, SAMPLES)
-            behind, seen = (render(x, position, rotation, {"type": "aov", "aovs": "p:position"}, 1) for x in scenes)
-            moves = (behind != seen).any(-1)
-            write_image(folder / "rgb" / "1x" / f"{name}.png", to_bytes(srgb(image)))
-            write_image(folder / "mask" / "1x" / f"{name}.png", np.tile(np.uint8(255) * moves[..., None], 3))
-            write_json(folder / "camera" / f"{name}.json", camera_file(position, rotation))
-            views[name] = {"camera_id": int(offset > 0), "warp_id": i, "appearance_id": i, "time_id": i}
+            image = linear_to_srgb(np.clip(image, 0, 1))
+            behind, hits = (render(x, position, rotation, {"type": "aov", "aovs": "p:position"}, 1) for x in scenes)
+            moves = (behind != hits).any(-1)
+            name = f"{i:06d}_r" if offset else f"{i:06d}"
+            seen.append((name, pinhole(position, rotation, time), image, moves))
             if not offset:
-                points.append(corners(image, seen, moves, position, -(-POINTS // frames), rng))
-    train = [name for name in views if not name.endswith("_r")]
-    test = [name for name in views if name.endswith("_r")]
-    lists = {"count": len(views), "num_exemplars": len(train), "ids": list(views)}
-    write_json(folder / "dataset.json", lists | {"train_ids": train, "val_ids": test})
-    write_json(folder / "metadata.json", views)
-    write_json(folder / "scene.json", {"scale": 1.0, "center": [0.0] * 3, "near": 1.0, "far": 12.0})
-    np.save(folder / "points.npy", np.concatenate(points).astype(np.float32))
+                points.append(corners(image, hits, moves, position, -(-POINTS // frames), rng))
+    train, test = (_split(*zip(*seen, strict=True)) for seen in views.values())
+    return Dataset("walk", WIDTH, HEIGHT, train, test, np.concatenate(points).astype(np.float32))
+
+
+def _split(
+    names: tuple[str, ...], cameras: tuple[Camera, ...], images: tuple[Image, ...], masks: tuple[Mask, ...]
+) -> Split:
+    stacked = Camera(*(np.array(values, np.float32) for values in zip(*cameras, strict=True)))
+    return Split(names, stacked, np.stack(images), masks=np.stack(masks))
 
 
 def camera(time: float, offset: float) -> tuple[Vector, Float64[np.ndarray, "3 3"]]:
@@ -104,19 +109,11 @@ def _axes(forward: Vector) -> Float64[np.ndarray, "3 3"]:
     return np.stack([right, np.cross(forward, right), forward])
 
 
-def camera_file(position: Vector, rotation: Float64[np.ndarray, "3 3"]) -> dict[str, Any]:
-    """A camera of the Nerfies layout."""
-    return {
-        "orientation": rotation.tolist(),
-        "position": position.tolist(),
-        "focal_length": FOCAL,
-        "principal_point": [WIDTH / 2, HEIGHT / 2],
-        "skew": 0.0,
-        "pixel_aspect_ratio": 1.0,
-        "radial_distortion": [0.0] * 3,
-        "tangential_distortion": [0.0] * 2,
-        "image_size": [WIDTH, HEIGHT],
-    }
+def pinhole(position: Vector, rotation: Float64[np.ndarray, "3 3"], time: float) -> Camera:
+    """A camera at an instant, as the package describes it."""
+    viewmat = np.eye(4)
+    viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ position
+    return Camera(viewmat, np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]]), np.float64(time))
 
 
 def render(
@@ -134,17 +131,11 @@ def render(
     return np.asarray(picture, np.float64)[..., :3]
 
 
-def srgb(linear: Image) -> Image:
-    """Linear light to sRGB values in [0, 1]."""
-    linear = np.clip(linear, 0, 1)
-    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
-
-
 def corners(
-    image: Image, hits: Image, moves: Bool[np.ndarray, "H W"], position: Vector, count: int, rng: np.random.Generator
+    image: Image, hits: Image, moves: Mask, position: Vector, count: int, rng: np.random.Generator
 ) -> Float64[np.ndarray, "N 3"]:
     """Points that a camera sees on static surfaces, the more where there is texture, off along their rays."""
-    grey = srgb(image).mean(-1)
+    grey = image.mean(-1)
     texture = np.hypot(cv2.Sobel(grey, -1, 1, 0), cv2.Sobel(grey, -1, 0, 1))
     texture[moves | (hits == 0).all(-1)] = 0
     chosen = rng.choice(texture.size, count, replace=False, p=(texture / texture.sum()).ravel())

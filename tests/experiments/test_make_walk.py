@@ -4,7 +4,7 @@ import pytest
 
 from experiments.makers import make_walk
 from l2dgs_jax.cameras.geometry import project_points
-from l2dgs_jax.data import load_dataset
+from l2dgs_jax.data import load_dataset, nerfies
 
 FRAMES = 4
 
@@ -15,7 +15,7 @@ def dataset(tmp_path_factory):
     folder = tmp_path_factory.mktemp("walk")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(make_walk, "SAMPLES", 1)
-        make_walk.make(folder, FRAMES)
+        nerfies.write(make_walk.make(FRAMES), folder)
     return load_dataset(str(folder))
 
 

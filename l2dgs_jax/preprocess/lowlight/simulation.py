@@ -22,7 +22,6 @@ from l2dgs_jax.preprocess.lowlight import darkening, weights
 from l2dgs_jax.visualize.sheet import sheet
 
 Bytes = UInt8[np.ndarray, "H W 3"]
-Image = Float32[np.ndarray, "H W 3"]
 
 
 MAX_ELECTRONS = 1e9
@@ -197,7 +196,7 @@ def _darkened(
     exposures: Sequence[float],
     name: str,
     cfg: DarkeningConfig,
-) -> Callable[[int], Image]:
+) -> Callable[[int], darkening.Image]:
     """A function that darkens each frame, by index; what is fitted is fitted to the pixels that count.
 
     Raises:
@@ -210,15 +209,15 @@ def _darkened(
     def light(pixels: Float32[np.ndarray, "P 1 3"]) -> Float32[np.ndarray, " P"]:
         return darkening.lightness(pixels, cfg.lab_order)[:, 0]
 
-    def by_lightness(i: int, darkener: darkening.Darkener) -> Image:
+    def by_lightness(i: int, darkener: darkening.Darkener) -> darkening.Image:
         return darkening.darken(_floats(pictures[i]), exposures[i], darkener, cfg.lab_order, cfg.allow_brightening)
 
     stride = -(-sum(picture.size // 3 for picture in pictures) // SAMPLED_PIXELS)
     sample = np.concatenate([pixels(i)[::stride] for i in range(len(pictures))])
-    level, expected = light(sample).mean(), darkening.exposure_map(light(sample), min(exposures)).mean()
-    if level <= expected:
+    sampled = light(sample)
+    if sampled.mean() <= darkening.exposure_map(sampled, min(exposures)).mean():
         raise UserError(
-            f"{name}: the mean lightness of its pictures is {level:.3f}; "
+            f"{name}: the mean lightness of its pictures is {sampled.mean():.3f}; "
             f"expected brighter ones than the exposure, {min(exposures):.3f}, or a lower --exposure"
         )
     fitted_to = pixels if cfg.per_image else lambda _: sample
@@ -244,7 +243,7 @@ def _stack(pictures: list[Bytes], in_file: bool) -> Float16[np.ndarray, "F H W 3
     return stacked(map(_floats, pictures), (len(pictures), *pictures[0].shape), np.float16, in_file)
 
 
-def _floats(picture: Bytes) -> Image:
+def _floats(picture: Bytes) -> darkening.Image:
     return picture.astype(np.float32) / 255
 
 
