@@ -1,9 +1,11 @@
 """The ground that things stand on, as far as the points of a scene show it, and distances along it."""
 
+from typing import NamedTuple
+
 import numpy as np
 from jaxtyping import Float
 
-from l2dgs_jax.cameras.geometry import mean_up, pixel_rays
+from l2dgs_jax.cameras.geometry import camera_centres, mean_up, pixel_rays
 
 DRAWS = 2000  # planes through three random points each
 COUNTED = 2000  # random points that vote for them
@@ -12,10 +14,20 @@ MIN_SHARE = 0.1  # of the points that must lie on the ground
 MAX_TILT = 55.0  # degrees between the ground's normal and the cameras' mean upward direction
 
 
-def ground_normal(
-    points: Float[np.ndarray, "P 3"], viewmats: Float[np.ndarray, "F 4 4"]
-) -> Float[np.ndarray, "3"] | None:
-    """The upward unit normal of the plane that most points lie on; None if few do, or cameras are held otherwise.
+class Ground(NamedTuple):
+    """A level plane.
+
+    Attributes:
+        up: its unit normal.
+        height: of its points along `up`, world units.
+    """
+
+    up: Float[np.ndarray, "3"]
+    height: float
+
+
+def find_ground(points: Float[np.ndarray, "P 3"], viewmats: Float[np.ndarray, "F 4 4"]) -> Ground | None:
+    """The plane that most points lie on; None if few do, or cameras are held otherwise.
 
     The plane is found by RANSAC and fitted to its points by least squares. The same points give the same plane.
 
@@ -41,8 +53,24 @@ def ground_normal(
     if votes[best] < MIN_SHARE:
         return None
     on_ground = points[np.abs((points - first[best]) @ normals[best]) < tolerance]
-    normal = np.linalg.svd(on_ground - on_ground.mean(0), full_matrices=False)[2][-1]
-    return normal * np.sign(normal @ up)
+    centre = on_ground.mean(0)
+    normal = np.linalg.svd(on_ground - centre, full_matrices=False)[2][-1]
+    normal *= np.sign(normal @ up)
+    return Ground(normal, float(normal @ centre))
+
+
+def ground_depths(
+    pixels: Float[np.ndarray, "N 2"],
+    viewmats: Float[np.ndarray, "N 4 4"],
+    Ks: Float[np.ndarray, "N 3 3"],
+    ground: Ground,
+) -> Float[np.ndarray, " N"]:
+    """Depths, in world units, at which the ground would be seen in pixels; infinite where it never is."""
+    rise = pixel_rays(pixels, viewmats, Ks) @ ground.up
+    below = ground.height - camera_centres(viewmats) @ ground.up
+    with np.errstate(divide="ignore", invalid="ignore"):
+        depths = below / rise
+    return np.where(depths > 0, depths, np.inf)
 
 
 def horizontal_per_depth(

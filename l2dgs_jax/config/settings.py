@@ -235,6 +235,7 @@ class OptimConfig:
     exposures_lr: Number = 1e-3  # learning rate of the gains of the training frames (model.exposure)
     curves_lr: Number = 1e-3  # learning rate of the tone curves (model.decomposition)
     decay_steps: OptionalCount = 20_000  # steps that a decay takes; None: the length of the stage
+    cooldown: Number = 0.0  # share of the run at its end in which all learning rates fall linearly to 0
     beta1: Number = 0.9  # decay of Adam's first moment
     beta2: Number = 0.999  # decay of Adam's second moment
     eps: Number = 1e-15  # added to the root of Adam's second moment

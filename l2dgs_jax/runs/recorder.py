@@ -17,6 +17,7 @@ from l2dgs_jax.runtime.files import append_line, replacing
 from l2dgs_jax.runtime.memory import memory_in_use
 from l2dgs_jax.training import Progress
 from l2dgs_jax.training.optimizer import learning_rates
+from l2dgs_jax.training.step import cooldown
 
 LOG_EVERY = 10  # steps between lines of the metrics file
 
@@ -91,6 +92,7 @@ class Recorder:
         alive = devices.member(progress.states.scene.alive, member)
         adam = progress.states.adam
         rates = jax.device_get(learning_rates(*devices.member((adam.schedules, adam.step), member)))
+        factor = cooldown(progress.step, self.config)
         values = {"loss": report.loss, "psnr": report.psnr, **report.terms}
         memory = memory_in_use()
         return {
@@ -100,7 +102,7 @@ class Recorder:
             "pairs": int(report.pairs),
             **{name: round(float(value), 6) for name, value in values.items()},
             "rate_factor": rate_factor(self.halvings),
-            "rates": {name: float(f"{float(rate):.3g}") for name, rate in rates.items()},
+            "rates": {name: float(f"{float(factor * rate):.3g}") for name, rate in rates.items()},
             "memory": None if memory is None else round(memory / 2**30, 3),
             "seconds": round(time.monotonic() - self.begun, 2),
         }

@@ -6,7 +6,6 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Float32, Int
 from scipy import sparse
-from scipy.ndimage import minimum_filter1d
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import cg
 from scipy.spatial import cKDTree
@@ -21,12 +20,15 @@ BORDER = 20  # pixels beyond the image in which points still count
 NEIGHBOUR_RADIUS = 9.0  # pixels within which tracks may belong to one object
 VELOCITY_SIGMA = 0.3  # standard deviation, in pixels per frame, of velocities within one object
 ALIKE = 0.5  # similarity of motion from which neighbours belong to one object
-COLUMNS = 6  # pixels to either side of an observation in which what its object hides counts
+COLUMNS = 6  # pixels to either side of an observation in which what its object hides counts at least
+COLUMNS_PER_HEIGHT = 0.15  # as many as this times the height of the object
+ON_GROUND = 0.8  # a surface is taken for the ground from this share of the depth at which the ground would be seen
 # Weights of squared differences of log-distances; the absolute error of the guess counts `TYPICAL_ERROR` times
 NEIGHBOUR_WEIGHT = 1.0  # between neighbours, times the similarity of their motion
 CURVATURE_WEIGHT = 1000.0  # second differences along a track
 CHANGE_WEIGHT = 30.0  # first differences along a track
 GIVEN_WEIGHT = 10.0  # depth that came with the scene, compared with a guess
+FLOATING_WEIGHT = 0.01  # being nearer than a guess that is not that of the ground
 TYPICAL_ERROR = 0.1  # of the guess, in log-distance
 SMALL_ERROR = 0.02  # below which errors of the guess count as squares
 ITERATIONS = 15
@@ -75,6 +77,7 @@ def shared_depths(
     tracks: Sequence[Tracks],
     hidden: Float32[np.ndarray, "F h w"],
     horizontal: Sequence[Float[np.ndarray, " _"]],
+    ground: Sequence[Float[np.ndarray, " _"]],
     given: Sequence[Float[np.ndarray, " _"]],
 ) -> list[Float[np.ndarray, " O"]]:
     """Depths of all observations of the tracks, solved for jointly, world units.
@@ -82,13 +85,17 @@ def shared_depths(
     Solved for are horizontal distances, because they are the same for all parts of an upright object. Where no depth is
     given, the first guess is the nearest that the object hides: most objects stand on something, which is what their
     lowest part hides. This is wrong where only the upper part is in view, or what seems to be one object is several; so
-    the solution may depart from it, and changes smoothly along a track and between neighbours that move alike.
+    the solution may depart from it, and changes smoothly along a track and between neighbours that move alike. If what
+    the lowest part hides is not the ground, as when a leg swings and the trunk seems to be an object by itself, then
+    the trunk is nearer, but the guess does not tell how much.
 
     Args:
         tracks: at least one, each with at least one observation in a cell of known depth.
         hidden: depths of the cells, NaN where unknown.
         horizontal: of each track's observations, the horizontal distance per unit of depth, positive; 1 for all if it
             is unknown where up is.
+        ground: of each track's observations, the depth at which the ground would be seen there, world units; NaN for
+            all if it is unknown.
         given: of each track's observations, the depth that came with the scene, world units; NaN where unknown.
     """
     lengths = [len(track.frames) for track in tracks]
@@ -96,11 +103,15 @@ def shared_depths(
     first, second, similarity = _neighbours(merged, np.concatenate([_velocities(track.pixels) for track in tracks]))
     alike = similarity > ALIKE
     per_depth = np.concatenate(horizontal)
-    behind = per_depth * np.concatenate([depths_at(track, hidden) for track in tracks])
+    of_ground = np.concatenate(ground)
+    behind = np.concatenate([depths_at(track, hidden) for track in tracks])
+    nearest = _nearest_hidden(merged, per_depth * behind, first[alike], second[alike])
     told = per_depth * np.concatenate(given)
-    guess = np.log(np.where(np.isfinite(told), told, _nearest_hidden(merged, behind, first[alike], second[alike])))
+    is_told = np.isfinite(told)
+    guess = np.log(np.where(is_told, told, (per_depth * behind)[nearest]))
     known = np.isfinite(guess)
-    trust = TYPICAL_ERROR * known * np.where(np.isfinite(told), GIVEN_WEIGHT, 1)
+    trust = TYPICAL_ERROR * known * np.where(is_told, GIVEN_WEIGHT, 1)
+    floats = ~is_told & (behind < ON_GROUND * of_ground)[nearest]
     guess = np.where(known, guess, guess[known].mean())
 
     owner = np.repeat(np.arange(len(tracks)), lengths)
@@ -115,6 +126,7 @@ def shared_depths(
     found = guess
     for _ in range(ITERATIONS):  # least absolute errors by reweighted least squares
         weights = trust / np.maximum(np.abs(found - guess), SMALL_ERROR)
+        weights = np.where(floats & (found < guess), FLOATING_WEIGHT, 1) * weights
         normal = (sparse.diags_array(weights) + smoothness).tocsr()
         found, _ = cg(normal, weights * guess, x0=found, rtol=1e-4, maxiter=500)
     return np.split(np.exp(found) / per_depth, np.cumsum(lengths)[:-1])
@@ -125,22 +137,24 @@ def _nearest_hidden(
     behind: Float[np.ndarray, " O"],
     first: Int[np.ndarray, " E"],
     second: Int[np.ndarray, " E"],
-) -> Float[np.ndarray, " O"]:
-    """For each observation, the smallest distance behind its object in the columns around; NaN if none is known.
+) -> Int[np.ndarray, " O"]:
+    """For each observation, which one of its object, in the columns around, hides what is nearest.
 
-    An object is what pairs of observations (`first`, `second`) of one frame connect.
+    An object is what pairs of observations (`first`, `second`) of one frame connect. `behind` are distances, NaN where
+    unknown.
     """
     count = len(behind)
     _, objects = connected_components(sparse.coo_array((np.ones(len(first)), (first, second)), (count, count)), False)
-    columns = tracks.pixels[:, 0].astype(int)
-    nearest = np.empty(count)
+    columns, rows = tracks.pixels.T
+    behind = np.where(np.isnan(behind), np.inf, behind)
+    nearest = np.empty(count, int)
     for group in _by_frame(tracks):
-        _, rows = np.unique(objects[group], return_inverse=True)
-        profile = np.full((rows.max() + 1, columns.max() + 1), np.inf)
-        np.fmin.at(profile, (rows, columns[group]), behind[group])
-        lowest = minimum_filter1d(profile, 2 * COLUMNS + 1, axis=1, mode="constant", cval=np.inf)
-        nearest[group] = lowest[rows, columns[group]]
-    return np.where(np.isfinite(nearest), nearest, np.nan)
+        group = group[np.argsort(objects[group], kind="stable")]
+        for part in np.split(group, np.flatnonzero(np.diff(objects[group])) + 1):
+            reach = max(COLUMNS, COLUMNS_PER_HEIGHT * np.ptp(rows[part]))
+            around = np.abs(columns[part][:, None] - columns[part]) <= reach
+            nearest[part] = part[np.where(around, behind[part], np.inf).argmin(-1)]
+    return nearest
 
 
 def _by_frame(tracks: Tracks) -> list[Int[np.ndarray, " N"]]:

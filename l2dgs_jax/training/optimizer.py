@@ -62,6 +62,7 @@ def adam(
     beta1: Float[Array, ""] | float,
     beta2: Float[Array, ""] | float,
     eps: Float[Array, ""] | float,
+    factor: Float[Array, ""] | float = 1.0,
 ) -> Transformation:
     """Adam (Kingma and Ba, arXiv 1412.6980) with bias correction and one schedule per group.
 
@@ -71,6 +72,7 @@ def adam(
         beta1: decay of the first moment.
         beta2: decay of the second moment.
         eps: added to the root of the second moment.
+        factor: on all rates.
 
     Raises:
         ValueError: a leaf's group has no schedule.
@@ -97,7 +99,7 @@ def adam(
 
         def move(group: str, m: Float[Array, "..."], v: Float[Array, "..."]) -> Float[Array, "..."]:
             t = step.astype(m.dtype)
-            return -lr[group] * (m / (1 - beta1**t)) / (jnp.sqrt(v / (1 - beta2**t)) + eps)
+            return -factor * lr[group] * (m / (1 - beta1**t)) / (jnp.sqrt(v / (1 - beta2**t)) + eps)
 
         return jax.tree.map(move, groups, mu, nu), AdamState(step, mu, nu, state.schedules)
 

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from l2dgs_jax.cameras.geometry import camera_centres, pixel_rays, project_points
-from l2dgs_jax.cameras.ground import ground_normal, horizontal_per_depth
+from l2dgs_jax.cameras.ground import Ground, find_ground, ground_depths, horizontal_per_depth
 from l2dgs_jax.data.dataset import Split
 from l2dgs_jax.model.deformation import path_weights
 from l2dgs_jax.model.initialisation import Seeds, path_knots, z_order
@@ -50,8 +50,8 @@ def find_seeds(points: Float[np.ndarray, "P 3"], split: Split, most: int) -> See
         shapes = ((0, 3), (0, 3), (0,), (0, knots, 3), (0, 2))
         return Seeds(*(np.zeros(shape, np.float32) for shape in shapes))
     hidden = np.stack([depths.hidden for depths in around])
-    horizontal = _horizontal(chosen, cameras, ground_normal(points, cameras.viewmat))
-    depths = shared_depths(chosen, hidden, horizontal, _given_depths(chosen, cameras, points, split))
+    given = _given_depths(chosen, cameras, points, split)
+    depths = shared_depths(chosen, hidden, *_of_ground(chosen, cameras, find_ground(points, cameras.viewmat)), given)
     seeds = [_seed(split, cameras, weights, *track) for track in zip(chosen, depths, strict=True)]
     found = Seeds(*(np.array(rows, np.float32) for rows in zip(*seeds, strict=True)))
     order = z_order(found.points)
@@ -122,18 +122,21 @@ def _fitted_path(weights: Float[np.ndarray, "O K"], places: Float[np.ndarray, "O
     return np.linalg.solve(normal, weights.T @ places)
 
 
-def _horizontal(
-    tracks: Sequence[Tracks], cameras: _Cameras, up: Float[np.ndarray, "3"] | None
-) -> list[Float[np.ndarray, " _"]]:
-    """Horizontal distance per unit of depth; 1 for all if it is unknown where up is, or cameras look too steeply."""
-    if up is not None:
-        factors = [
-            horizontal_per_depth(track.pixels, cameras.viewmat[track.frames], cameras.K[track.frames], up)
-            for track in tracks
-        ]
-        if min(factor.min() for factor in factors) > MIN_HORIZONTAL:
-            return factors
-    return [np.ones(len(track.frames)) for track in tracks]
+def _of_ground(
+    tracks: Sequence[Tracks], cameras: _Cameras, ground: Ground | None
+) -> tuple[list[Float[np.ndarray, " _"]], list[Float[np.ndarray, " _"]]]:
+    """Horizontal distance per unit of depth, and depth of the ground, for the observations of each track.
+
+    The former is 1 for all if it is unknown where up is, or cameras look too steeply; the latter is NaN for all if
+    there is no ground.
+    """
+    ones = [np.ones(len(track.frames)) for track in tracks]
+    if ground is None:
+        return ones, [np.nan * one for one in ones]
+    places = [(track.pixels, cameras.viewmat[track.frames], cameras.K[track.frames]) for track in tracks]
+    horizontal = [horizontal_per_depth(*place, ground.up) for place in places]
+    steep = min(factor.min() for factor in horizontal) <= MIN_HORIZONTAL
+    return ones if steep else horizontal, [ground_depths(*place, ground) for place in places]
 
 
 def _given_depths(

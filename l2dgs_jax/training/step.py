@@ -50,7 +50,7 @@ def train_step(
         loss, gradient, probe_sum = devices.mean_over((loss, gradient, probe_gradient.sum(0)), axis)
         return (loss, (report._replace(loss=loss), devices.max_over(radii.max(0), axis), probe_sum)), gradient
 
-    transformation = adam(state.scene.params, state.adam.schedules, config)
+    transformation = adam(state.scene.params, state.adam.schedules, config, _pace(state, config))
     params, adam_state, (report, radii, probe_gradient), norm = optimizer.take_step(
         value_and_grad, transformation, state.scene.params, state.adam
     )
@@ -83,14 +83,29 @@ def _disturbed(gaussians: Gaussians, state: TrainState, config: Config) -> Gauss
     """The Gaussians after the noise of this step, which fades with the learning rate of the centres."""
     scene, cfg = state.scene, config.density
     rate = optimizer.learning_rate(state.adam.schedules["means"], state.adam.step + 1)
-    size = cfg.noise * rate / jnp.where(scene.extent > 0, scene.extent, 1) ** 2
+    size = cfg.noise * _pace(state, config) * rate / jnp.where(scene.extent > 0, scene.extent, 1) ** 2
     key = jax.random.fold_in(randomness(state, config), 1)
     return relocation.disturb(gaussians, scene.alive, size, key, cfg.prune_opacity)
 
 
-def adam(params: SceneParams, rates: dict[str, optimizer.Schedule], config: Config) -> optimizer.Transformation:
-    """The optimizer of all of `params`."""
-    return optimizer.adam(groups(params), rates, config.optim.beta1, config.optim.beta2, config.optim.eps)
+def cooldown(step: Float[Array, ""] | int, config: Config) -> Float[Array, ""]:
+    """The factor on all learning rates after `step` steps of the run, which falls to 0 in `optim.cooldown` of it."""
+    share, left = config.optim.cooldown, 1 - step / config.steps
+    return jnp.where(share > 0, jnp.minimum(left / jnp.where(share > 0, share, 1.0), 1.0), 1.0)
+
+
+def _pace(state: TrainState, config: Config) -> Float[Array, ""]:
+    return cooldown(state.step.astype(state.stats.seen.dtype), config)
+
+
+def adam(
+    params: SceneParams,
+    rates: dict[str, optimizer.Schedule],
+    config: Config,
+    factor: Float[Array, ""] | float = 1.0,
+) -> optimizer.Transformation:
+    """The optimizer of all of `params`; `factor` is on all rates."""
+    return optimizer.adam(groups(params), rates, config.optim.beta1, config.optim.beta2, config.optim.eps, factor)
 
 
 def begin_stage(scene: Scene, step: Int[Array, ""], config: Config, stage_steps: int) -> TrainState:

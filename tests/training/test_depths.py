@@ -21,10 +21,10 @@ def cells(value=2.0):
     return np.full((FRAMES, HEIGHT // DEPTH_CELL, WIDTH // DEPTH_CELL), value, np.float32)
 
 
-def solved(tracks, hidden, factors=1.0, given=np.nan):
-    """Depths of tracks whose horizontal distance is that many times their depth."""
-    everywhere = lambda value: [np.broadcast_to(value, len(one.frames)) for one in tracks]
-    return shared_depths(tracks, hidden, everywhere(factors), everywhere(given))
+def solved(tracks, hidden, factors=1.0, ground=np.nan, given=np.nan):
+    """Depths of tracks; the rest is the same for all, or has a row for each track or a column for each frame."""
+    rest = (list(np.broadcast_to(value, (len(tracks), FRAMES))) for value in (factors, ground, given))
+    return shared_depths(tracks, hidden, *rest)
 
 
 def test_depths_around_are_ordered_and_lie_within_those_of_the_points():
@@ -74,9 +74,9 @@ def test_an_object_is_as_near_as_the_nearest_surface_that_it_hides():
 
 def test_an_upright_object_has_one_horizontal_distance():
     alike = [track(i, (4.5, 4.5 + 4 * i), (1, 0)) for i in range(3)]
-    factors = [np.full(FRAMES, factor) for factor in (1.0, 0.9, 0.8)]
-    found = shared_depths(alike, cells(), factors, [np.full(FRAMES, np.nan)] * 3)
-    assert_allclose(found * np.array(factors), 1.6, rtol=1e-3)  # that of the lowest part, at depth 2
+    factors = np.array([[1.0], [0.9], [0.8]])
+    found = solved(alike, cells(), factors)
+    assert_allclose(found * factors, 1.6, rtol=1e-3)  # that of the lowest part, at depth 2
 
 
 def test_what_an_object_hides_in_distant_columns_does_not_count():
@@ -85,6 +85,24 @@ def test_what_an_object_hides_in_distant_columns_does_not_count():
     row = [track(i, (2.5 + 5 * i, 12.5), (0, 0.5)) for i in range(6)]
     found = solved(row, depths)
     assert found[-1].max() < 3 < found[0].min()
+
+
+def test_the_taller_an_object_the_wider_it_stands():
+    depths = np.full((FRAMES, 16, WIDTH // DEPTH_CELL), 4, np.float32)
+    depths[:, 15, 2] = 2.0  # below a foot to the left
+    for top, depth in ((1.5, 2.0), (52.5, 4.0)):
+        foot, *pole = ((10.5, 62.5), *((18.5, row) for row in np.arange(top, 63, 5)))
+        found = solved([track(i, start, (0, 0)) for i, start in enumerate([foot, *pole])], depths)
+        assert_allclose(found[1], depth, rtol=0.1)
+
+
+def test_a_trunk_before_a_wall_is_as_near_as_the_leg_that_reaches_the_ground():
+    depths = cells(4.0)
+    depths[:, 4:] = 2.0
+    body = [track(i, (8.5, 1.5 + 5 * i), (1.0 if i < 3 else 1.5, 0)) for i in range(5)]
+    ground = np.array([[9.0], [9.0], [9.0], [2.0], [2.0]])
+    assert solved(body, depths)[0].min() > 3
+    assert_allclose(solved(body, depths, ground=ground), 2, rtol=0.1)
 
 
 def test_a_few_wrong_depths_do_not_move_a_track():
@@ -117,5 +135,5 @@ def test_depth_that_is_given_outweighs_the_guess():
 
 @pytest.mark.parametrize("factor", [1.0, 0.7])
 def test_given_depth_is_no_horizontal_distance(factor):
-    (depth,) = solved([track(0, (4.5, 4.5), (1, 0.5))], cells(), factor, 1.5)
+    (depth,) = solved([track(0, (4.5, 4.5), (1, 0.5))], cells(), factor, given=1.5)
     assert_allclose(depth, 1.5, rtol=1e-3)

@@ -18,7 +18,7 @@ from l2dgs_jax.training import engine, initial_state, losses, objective
 from l2dgs_jax.training.batching import view_indices
 from l2dgs_jax.training.parameter_groups import groups
 from l2dgs_jax.training.state import StepReport
-from l2dgs_jax.training.step import train_step
+from l2dgs_jax.training.step import cooldown, train_step
 
 COARSE, FINE = 10, 15
 
@@ -170,6 +170,28 @@ def test_learning_rates_decay_over_their_stage_or_decay_steps(dataset, journal, 
         assert {float(schedule.steps) for schedule in schedules.values()} == {length}
         np.testing.assert_allclose(schedules["means"].start, config.optim.means_lr * extent)
         np.testing.assert_allclose(schedules["bafe"].start, config.optim.bafe_lr)
+
+
+@pytest.mark.parametrize(("share", "factors"), [(0.0, [1, 1, 1, 1]), (0.5, [1, 1, 0.5, 0]), (1.0, [1, 0.5, 0.25, 0])])
+def test_learning_rates_fall_to_0_in_the_last_share_of_the_run(share, factors):
+    config = config_of(**{"coarse_steps": 20, "fine_steps": 80, "optim.cooldown": share})
+    np.testing.assert_allclose([cooldown(step, config) for step in (0, 50, 75, 100)], factors)
+
+
+def test_a_step_near_the_end_is_as_much_shorter_as_its_learning_rate(dataset):
+    config, batch = config_of(), batch_of(dataset.train, [0, 3])
+    state = initial_state(dataset, config)._replace(step=jnp.int32(COARSE + FINE - 1))
+
+    @jax.jit
+    def movement(share):
+        own = overrides.replace(config, {"optim.cooldown": share})
+        after, _ = train_step(state, batch, own, moving=True, pair_capacity=4096)
+        return jax.tree.map(jnp.subtract, after.scene.params, state.scene.params)
+
+    whole, part = movement(0.0), movement(0.5)
+    assert max(jnp.abs(x).max() for x in jax.tree.leaves(whole)) > 1e-4
+    factor = 1 / (0.5 * (COARSE + FINE))
+    jax.tree.map(lambda x, y: np.testing.assert_allclose(y, factor * x, atol=1e-12), whole, part)
 
 
 def test_adam_is_reset_at_the_fine_stage_but_not_on_resuming(dataset, journal):
