@@ -20,15 +20,15 @@ BORDER = 20  # pixels beyond the image in which points still count
 NEIGHBOUR_RADIUS = 9.0  # pixels within which tracks may belong to one object
 VELOCITY_SIGMA = 0.3  # standard deviation, in pixels per frame, of velocities within one object
 ALIKE = 0.5  # similarity of motion from which neighbours belong to one object
-COLUMNS = 6  # pixels to either side of an observation in which what its object hides counts at least
-COLUMNS_PER_HEIGHT = 0.15  # as many as this times the height of the object
+STRIDE = 8  # frames before and after, over which a limb moves on average as the body that it swings about
+COLUMNS = 6  # pixels to either side of an observation in which what its object hides counts
 ON_GROUND = 0.8  # a surface is taken for the ground from this share of the depth at which the ground would be seen
 # Weights of squared differences of log-distances; the absolute error of the guess counts `TYPICAL_ERROR` times
 NEIGHBOUR_WEIGHT = 1.0  # between neighbours, times the similarity of their motion
 CURVATURE_WEIGHT = 1000.0  # second differences along a track
 CHANGE_WEIGHT = 30.0  # first differences along a track
 GIVEN_WEIGHT = 10.0  # depth that came with the scene, compared with a guess
-FLOATING_WEIGHT = 0.01  # being nearer than a guess that is not that of the ground
+FLOATING_WEIGHT = 0.3  # being nearer than a guess that is not that of the ground
 TYPICAL_ERROR = 0.1  # of the guess, in log-distance
 SMALL_ERROR = 0.02  # below which errors of the guess count as squares
 ITERATIONS = 15
@@ -84,10 +84,11 @@ def shared_depths(
 
     Solved for are horizontal distances, because they are the same for all parts of an upright object. Where no depth is
     given, the first guess is the nearest that the object hides: most objects stand on something, which is what their
-    lowest part hides. This is wrong where only the upper part is in view, or what seems to be one object is several; so
-    the solution may depart from it, and changes smoothly along a track and between neighbours that move alike. If what
-    the lowest part hides is not the ground, as when a leg swings and the trunk seems to be an object by itself, then
-    the trunk is nearer, but the guess does not tell how much.
+    lowest part hides. A trunk on swinging legs seems to be an object by itself that hides what is far behind it. Hence,
+    where the nearest that an object hides is not the ground, whatever moves alike on average over a longer time belongs
+    to it too; if that does not reach the ground either, the object may be nearer than the guess at little cost. The
+    guess is also wrong where only the upper part is in view, or what seems to be one object is several; so the solution
+    may depart from it, and changes smoothly along a track and between neighbours that move alike.
 
     Args:
         tracks: at least one, each with at least one observation in a cell of known depth.
@@ -100,25 +101,29 @@ def shared_depths(
     """
     lengths = [len(track.frames) for track in tracks]
     merged = Tracks(*(np.concatenate(parts) for parts in zip(*tracks, strict=True)))
-    first, second, similarity = _neighbours(merged, np.concatenate([_velocities(track.pixels) for track in tracks]))
-    alike = similarity > ALIKE
+    pairs = _neighbours(merged)
+    similarity, on_average = (_similarity(pairs, tracks, reach) for reach in (0, STRIDE))
     per_depth = np.concatenate(horizontal)
-    of_ground = np.concatenate(ground)
     behind = np.concatenate([depths_at(track, hidden) for track in tracks])
-    nearest = _nearest_hidden(merged, per_depth * behind, first[alike], second[alike])
+    floats = behind < ON_GROUND * np.concatenate(ground)
+    behind *= per_depth
+    nearest, of_body = (
+        _nearest_hidden(merged, behind, pairs[:, similar > ALIKE]) for similar in (similarity, on_average)
+    )
+    nearest = np.where(floats[nearest] & (behind[of_body] < behind[nearest]), of_body, nearest)
     told = per_depth * np.concatenate(given)
     is_told = np.isfinite(told)
-    guess = np.log(np.where(is_told, told, (per_depth * behind)[nearest]))
+    guess = np.log(np.where(is_told, told, behind[nearest]))
     known = np.isfinite(guess)
     trust = TYPICAL_ERROR * known * np.where(is_told, GIVEN_WEIGHT, 1)
-    floats = ~is_told & (behind < ON_GROUND * of_ground)[nearest]
+    one_sided = floats[nearest] & ~is_told
     guess = np.where(known, guess, guess[known].mean())
 
     owner = np.repeat(np.arange(len(tracks)), lengths)
     steps, bends = (np.flatnonzero(owner[n:] == owner[:-n]) for n in (1, 2))
     count = len(guess)
     terms = (
-        _differences(count, (first, second), (1, -1), NEIGHBOUR_WEIGHT * similarity),
+        _differences(count, tuple(pairs), (1, -1), NEIGHBOUR_WEIGHT * similarity),
         _differences(count, (steps, steps + 1), (1, -1), CHANGE_WEIGHT),
         _differences(count, (bends, bends + 1, bends + 2), (1, -2, 1), CURVATURE_WEIGHT),
     )
@@ -126,33 +131,28 @@ def shared_depths(
     found = guess
     for _ in range(ITERATIONS):  # least absolute errors by reweighted least squares
         weights = trust / np.maximum(np.abs(found - guess), SMALL_ERROR)
-        weights = np.where(floats & (found < guess), FLOATING_WEIGHT, 1) * weights
+        weights = np.where(one_sided & (found < guess), FLOATING_WEIGHT, 1) * weights
         normal = (sparse.diags_array(weights) + smoothness).tocsr()
         found, _ = cg(normal, weights * guess, x0=found, rtol=1e-4, maxiter=500)
     return np.split(np.exp(found) / per_depth, np.cumsum(lengths)[:-1])
 
 
 def _nearest_hidden(
-    tracks: Tracks,
-    behind: Float[np.ndarray, " O"],
-    first: Int[np.ndarray, " E"],
-    second: Int[np.ndarray, " E"],
+    tracks: Tracks, behind: Float[np.ndarray, " O"], alike: Int[np.ndarray, "2 E"]
 ) -> Int[np.ndarray, " O"]:
     """For each observation, which one of its object, in the columns around, hides what is nearest.
 
-    An object is what pairs of observations (`first`, `second`) of one frame connect. `behind` are distances, NaN where
-    unknown.
+    An object is what pairs of observations of one frame connect. `behind` are distances, NaN where unknown.
     """
     count = len(behind)
-    _, objects = connected_components(sparse.coo_array((np.ones(len(first)), (first, second)), (count, count)), False)
-    columns, rows = tracks.pixels.T
+    _, objects = connected_components(sparse.coo_array((np.ones(alike.shape[1]), alike), (count, count)), False)
+    columns = tracks.pixels[:, 0]
     behind = np.where(np.isnan(behind), np.inf, behind)
     nearest = np.empty(count, int)
     for group in _by_frame(tracks):
         group = group[np.argsort(objects[group], kind="stable")]
         for part in np.split(group, np.flatnonzero(np.diff(objects[group])) + 1):
-            reach = max(COLUMNS, COLUMNS_PER_HEIGHT * np.ptp(rows[part]))
-            around = np.abs(columns[part][:, None] - columns[part]) <= reach
+            around = np.abs(columns[part][:, None] - columns[part]) <= COLUMNS
             nearest[part] = part[np.where(around, behind[part], np.inf).argmin(-1)]
     return nearest
 
@@ -163,21 +163,24 @@ def _by_frame(tracks: Tracks) -> list[Int[np.ndarray, " N"]]:
     return np.split(order, np.flatnonzero(np.diff(tracks.frames[order])) + 1)
 
 
-def _velocities(pixels: Float[np.ndarray, "O 2"]) -> Float[np.ndarray, "O 2"]:
-    """Pixels from each observation of a track to the next one; the last repeats the one before."""
-    steps = np.diff(pixels, axis=0)
-    return np.concatenate([steps, steps[-1:]])
-
-
-def _neighbours(
-    tracks: Tracks, velocities: Float[np.ndarray, "O 2"]
-) -> tuple[Int[np.ndarray, " E"], Int[np.ndarray, " E"], Float[np.ndarray, " E"]]:
-    """Pairs of observations that are close to each other in a frame, and how similarly they move, in (0, 1]."""
+def _neighbours(tracks: Tracks) -> Int[np.ndarray, "2 E"]:
+    """Pairs of observations that are close to each other in a frame."""
     close = lambda pixels: cKDTree(pixels).query_pairs(NEIGHBOUR_RADIUS, output_type="ndarray")
-    pairs = [group[close(tracks.pixels[group])] for group in _by_frame(tracks)]
-    first, second = np.concatenate(pairs).T
-    squared = np.square(velocities[first] - velocities[second]).sum(-1)
-    return first, second, np.exp(-squared / (2 * VELOCITY_SIGMA**2))
+    return np.concatenate([group[close(tracks.pixels[group])] for group in _by_frame(tracks)]).T
+
+
+def _similarity(pairs: Int[np.ndarray, "2 E"], tracks: Sequence[Tracks], reach: int) -> Float[np.ndarray, " E"]:
+    """How similarly pairs of observations move, in (0, 1], on average over `reach` more frames before and after."""
+    velocities = np.concatenate([_velocities(track.pixels, reach) for track in tracks])
+    first, second = velocities[pairs]
+    return np.exp(-np.square(first - second).sum(-1) / (2 * VELOCITY_SIGMA**2))
+
+
+def _velocities(pixels: Float[np.ndarray, "O 2"], reach: int) -> Float[np.ndarray, "O 2"]:
+    """Mean pixels per frame around each step of a track to its next observation; the last repeats the one before."""
+    places, last = np.arange(len(pixels)), len(pixels) - 1
+    start, end = np.clip(places - reach, 0, last - 1), np.clip(places + reach + 1, 1, last)
+    return (pixels[end] - pixels[start]) / (end - start)[:, None]
 
 
 def _differences(
