@@ -297,7 +297,6 @@ class Config:
     keep_checkpoints: int = 2  # number of checkpoints to keep, in case the last one is damaged
     # share of the training views that lie between two frames, synthesised by optical flow (training/inbetweens.py)
     inbetweens: float = 0.0
-    denoise: bool = False  # whether frames are averaged with what their neighbours show (training/denoising.py)
     # how the frames are brightened before training, for a model of well-lit frames (preprocess/enhancement.py)
     enhance: Enhancement = "none"
     frame_memory: float = 4.0  # GiB of memory for the scene's frames; if they take more, they go to temporary files

@@ -21,7 +21,6 @@ from l2dgs_jax.runtime.capacity import next_capacity
 from l2dgs_jax.runtime.devices import MEMBERS, VIEWS
 from l2dgs_jax.runtime.prefetch import prefetch
 from l2dgs_jax.training.batching import load_batch, next_batch
-from l2dgs_jax.training.denoising import denoised
 from l2dgs_jax.training.flows import neighbour_flows
 from l2dgs_jax.training.state import Batch, StepReport, TrainState, with_capacity
 from l2dgs_jax.training.step import begin_stage, densify, train_step, tree_where
@@ -92,14 +91,11 @@ def run(members: Sequence[Member], pair_capacity: int | None = None, mesh: Mesh 
     values = devices.shard({name: _stack(column) for name, column in columns.items()}, mesh, MEMBERS)
 
     splits = {id(member.split): member.split for member in members}
-    with_flows = splits if config.inbetweens or config.denoise else {}
-    flows = {key: neighbour_flows(split, filled=True) for key, split in with_flows.items()}
-    if config.denoise:
-        splits = {key: denoised(split, flows[key]) for key, split in splits.items()}
-    between = flows if config.inbetweens else {}
+    flows = {key: neighbour_flows(split, filled=True) if config.inbetweens else None for key, split in splits.items()}
     steps = range(start, config.steps)
-    batch_of = lambda key, own, step: next_batch(splits[key], own, step, between.get(key))
-    read = prefetch(lambda step: _stack([batch_of(id(m.split), m.config, step) for m in members]), steps)
+    read = prefetch(
+        lambda step: _stack([next_batch(m.split, m.config, step, flows[id(m.split)]) for m in members]), steps
+    )
     with contextlib.closing(read):  # its threads read the next batches while a step is computed
         for step, batches in zip(steps, read, strict=True):
             moving = step >= config.coarse_steps

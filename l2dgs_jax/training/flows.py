@@ -1,10 +1,10 @@
-"""Optical flow from frame to frame of a video, for tracks, views between frames, and frames with less noise."""
+"""Optical flow from frame to frame of a video, from which views between frames and tracks are made."""
 
 from typing import NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float16, Float32, Int, UInt8
+from jaxtyping import Float16, Float32, Int, UInt8
 
 from l2dgs_jax.cameras.flow import brightened, match, optical_flow, pixel_indices, smooth_flow
 from l2dgs_jax.cameras.geometry import camera_centres
@@ -54,36 +54,6 @@ def neighbour_flows(split: Split, *, filled: bool = False) -> Flows:
     displacements = stacked(prefetch(both_directions, frames), shape, np.float16, in_file)
     usable = [bool(np.isfinite(flow).any()) for flow in displacements]
     return Flows(np.where(usable, following, frames), displacements)
-
-
-def warped(
-    split: Split, frame: int, flow: Float32[np.ndarray, "H W 2"]
-) -> tuple[Float32[np.ndarray, "H W 3"], Bool[np.ndarray, "H W"]]:
-    """The image of a frame sampled at each pixel plus its flow, and where that is known."""
-    image = split.images[frame].astype(np.float32)
-    at = flow + pixel_indices(*image.shape[:2])
-    known = _inside(at)
-    columns, rows = np.moveaxis(np.where(known[..., None], at, 0), -1, 0)
-    if split.valid is not None:
-        known &= cv2.remap(split.valid[frame].astype(np.float32), columns, rows, cv2.INTER_LINEAR) > 0.999
-    return cv2.remap(image, columns, rows, cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REPLICATE), known
-
-
-def concatenated(
-    first: Float32[np.ndarray, "H W 2"], second: Float32[np.ndarray, "H W 2"]
-) -> Float32[np.ndarray, "H W 2"]:
-    """The flow to a frame and from there to the next; NaN where either is unknown."""
-    at = first + pixel_indices(*first.shape[:2])
-    known = _inside(at)[..., None]
-    columns, rows = np.moveaxis(np.where(known, at, 0), -1, 0)
-    onward = cv2.remap(second, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.where(known, first + onward, np.float32(np.nan))
-
-
-def _inside(at: Float32[np.ndarray, "H W 2"]) -> Bool[np.ndarray, "H W"]:
-    """Whether pixel indices lie in the image; not where they are NaN."""
-    height, width = at.shape[:2]
-    return np.all((at >= 0) & (at <= (width - 1, height - 1)), axis=-1)
 
 
 def _following(cameras: Camera) -> Int[np.ndarray, " F"]:

@@ -11,9 +11,10 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float16, Float32
 
+from l2dgs_jax.cameras.flow import pixel_indices
 from l2dgs_jax.cameras.geometry import between
 from l2dgs_jax.data.dataset import Split
-from l2dgs_jax.training.flows import Flows, warped
+from l2dgs_jax.training.flows import Flows
 from l2dgs_jax.types import Camera
 
 # A pixel is invalid if the two warped frames differ by more than a factor times the median over the view plus a margin.
@@ -51,7 +52,7 @@ def draw(split: Split, flows: Flows, frame: int, part: float) -> View:
         (1 - part) ** 2 * forward - part * (1 - part) * backward,
     )
     ends = (frame, other)
-    (first, first_seen), (second, second_seen) = (warped(split, *end) for end in zip(ends, to_frames, strict=True))
+    (first, first_seen), (second, second_seen) = (_warped(split, *end) for end in zip(ends, to_frames, strict=True))
     valid = first_seen & second_seen
     difference = np.maximum(_dissimilarity(first, second), _dissimilarity(second, first))
     difference = cv2.blur(np.where(valid, difference, 0), (3, 3))
@@ -71,3 +72,17 @@ def _dissimilarity(
     window = np.ones((3, 3), np.uint8)
     low, high = cv2.erode(second, window), cv2.dilate(second, window)
     return np.maximum(np.maximum(low - first, first - high), 0).mean(-1)
+
+
+def _warped(
+    split: Split, frame: int, flow: Float32[np.ndarray, "H W 2"]
+) -> tuple[Float32[np.ndarray, "H W 3"], Bool[np.ndarray, "H W"]]:
+    """The image of a frame sampled at each pixel plus its flow, and where that is known."""
+    image = split.images[frame].astype(np.float32)
+    height, width = image.shape[:2]
+    at = flow + pixel_indices(height, width)
+    known: np.ndarray = np.all((at >= 0) & (at <= (width - 1, height - 1)), axis=-1)  # not where flow is NaN
+    columns, rows = np.moveaxis(np.where(known[..., None], at, 0), -1, 0)
+    if split.valid is not None:
+        known &= cv2.remap(split.valid[frame].astype(np.float32), columns, rows, cv2.INTER_LINEAR) > 0.999
+    return cv2.remap(image, columns, rows, cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REPLICATE), known
