@@ -102,9 +102,18 @@ def _changes(
     hidden, motion = networks.apply_heads(scene.params.heads, field)
     changes = _Changes(motion, networks.apply_ocd(scene.params.ocd, hidden) - 1 if cfg.ocd else None)
     if gate is not None:
-        factor = jax.nn.sigmoid(chosen(gate))
+        factor = openness(chosen(gate), cfg)
         changes = jax.tree.map(lambda rows: factor.reshape(1, -1, *[1] * (rows.ndim - 2)) * rows, changes)
     return changes if subset is None else jax.tree.map(lambda rows: compaction.expand(rows, subset, 1), changes)
+
+
+def openness(gate: Float[Array, " N"], cfg: ModelConfig) -> Float[Array, " N"]:
+    """The factors in [0, 1] of motion gates; 0 below `cfg.shut_gates`, without gradient, so that they stay shut.
+
+    Fading alone would not make a Gaussian static: where nothing moves, the field can grow as a gate closes.
+    """
+    factor = jax.nn.sigmoid(gate)
+    return jnp.where(factor < cfg.shut_gates, 0, factor)
 
 
 def _growth(log_scales: Float[Array, "V N 3"], cfg: ModelConfig) -> Float[Array, "V N 3"]:

@@ -8,7 +8,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from l2dgs_jax.config import ModelConfig
 from l2dgs_jax.model import compaction
-from l2dgs_jax.model.deformation import deform, has_path, length_unit
+from l2dgs_jax.model.deformation import deform, has_path, length_unit, openness
 from l2dgs_jax.types import Camera, Scene
 
 DRAWN = 1024  # Gaussians that are looked at in one step
@@ -36,7 +36,8 @@ def rigidity(scene: Scene, cfg: ModelConfig, key: PRNGKeyArray) -> Float[Array, 
     span = jax.random.uniform(for_span, (), dtype, *SPANS)
     first = (1 - span) * jax.random.uniform(for_first, (), dtype)
     instants = jnp.stack([first, first + span])
-    log_weights = jnp.where(scene.alive, 0 if gaussians.gate is None else jax.nn.log_sigmoid(gaussians.gate), -jnp.inf)
+    weights = 1 if gaussians.gate is None else openness(gaussians.gate, cfg)
+    log_weights = jnp.log(jnp.where(scene.alive, weights, 0))
     if gaussians.lifetimes is not None:
         born, dies = gaussians.lifetimes.T
         present = (born <= instants[0]) & (instants[1] <= dies)

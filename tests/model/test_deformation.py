@@ -254,6 +254,29 @@ def test_the_gate_interpolates_between_no_motion_and_full_motion():
             np.testing.assert_allclose(value, expected, atol=1e-12, err_msg=name)
 
 
+def test_what_is_behind_a_shut_gate_stands_still_and_its_gate_stays_shut():
+    params, cameras = random_params(), views()
+    logits = np.array([1.0, -3.0, 2.0, 0.5, -4.0, -1.0])
+    cfg = dataclasses.replace(CFG, shut_gates=0.3)
+    shut = 1 / (1 + np.exp(-logits)) < 0.3
+    assert 0 < shut.sum() < N
+    undeformed, fading, moved = (
+        deformed(gated(params, logits), cameras=cameras, moving=moving, cfg=own)
+        for moving, own in ((False, CFG), (True, CFG), (True, cfg))
+    )
+    for name in moved._fields:
+        value, still, free = (np.asarray(getattr(x, name)) for x in (moved, undeformed, fading))
+        np.testing.assert_array_equal(value[:, shut], still[:, shut], err_msg=name)
+        np.testing.assert_array_equal(value[:, ~shut], free[:, ~shut], err_msg=name)
+
+    def f(params):
+        return deformed(params, cameras=cameras, moving=True, cfg=cfg)
+
+    check_grads(f, (gated(params, logits),), 1, ["rev"], eps=1e-6)
+    gradient = jax.grad(lambda params: sum(x.sum() for x in f(params)))(gated(params, logits)).gaussians.gate
+    np.testing.assert_array_equal(gradient != 0, ~shut)
+
+
 def test_with_a_moving_share_only_gaussians_with_the_largest_gates_move():
     params, cameras = random_params(), views()
     logits, largest = np.array([1.0, -3.0, 2.0, 0.5, -4.0, -1.0]), np.array([0, 2, 3])
