@@ -50,6 +50,7 @@ def _presets() -> dict[str, Config]:
             unit="depth",
             scale_growth="linear",  # growing exponentially, a few Gaussians come to fill the image
             motion_gate=True,
+            shut_gates=0.3,  # otherwise static parts keep moving a little, and the longer they train the more
             tracks=True,
             surfaces=True,  # in the dark, structure from motion finds few points
             hidden=64,
@@ -89,6 +90,7 @@ def _presets() -> dict[str, Config]:
             planes_lr=1.6e-2,
             ocd_lr=5e-5,
             decay_steps=2400,  # motion would remain half learned if its rates decayed fully within the run
+            cooldown=0.3,
         ),
         # New Gaussians leave the image nearly unchanged. None is relocated (prune_opacity 0), because moving things are
         # faint before their motion is learned.
