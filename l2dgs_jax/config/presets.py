@@ -90,7 +90,7 @@ def _presets() -> dict[str, Config]:
             planes_lr=1.6e-2,
             ocd_lr=5e-5,
             decay_steps=2400,  # motion would remain half learned if its rates decayed fully within the run
-            cooldown=0.3,
+            cooldown=0.3,  # otherwise the views of the last steps count more than others
         ),
         # New Gaussians leave the image nearly unchanged. None is relocated (prune_opacity 0), because moving things are
         # faint before their motion is learned.

@@ -153,8 +153,6 @@ class ModelConfig:
     unit_exponent: Literal["b1", "b2"] | None = None  # the exponent that is fixed at 1 (Table 3, B1 = 1 and B2 = 1)
 
     def __post_init__(self) -> None:
-        if not 0 <= self.shut_gates < 1:
-            raise UserError(f"--model.shut-gates {self.shut_gates}: expected at least 0 and less than 1")
         if not 0 < self.moving_share <= 1:
             raise UserError(f"--model.moving-share {self.moving_share}: expected more than 0 and at most 1")
         if self.domain == "light" and isinstance(self.tone, float | int):
@@ -340,6 +338,8 @@ class Config:
             ("--seed", self.seed, 0 <= self.seed < 2**31, "a whole number from 0 below 2^31"),
             ("--inbetweens", self.inbetweens, 0 <= self.inbetweens < 1, "at least 0 and less than 1"),
             ("--drop", self.drop, 0 <= self.drop < 1, "at least 0 and less than 1"),
+            ("--optim.cooldown", self.optim.cooldown, 0 <= self.optim.cooldown <= 1, "from 0 to 1"),
+            ("--model.shut-gates", model.shut_gates, 0 <= model.shut_gates < 1, "at least 0 and less than 1"),
             ("--model.box-rim", model.box_rim, 0 <= model.box_rim < 1, "at least 0 and less than 1"),
             ("--model.box-points", model.box_points, 0 < model.box_points <= 1, "more than 0 and at most 1"),
             ("--model.initial-opacity", model.initial_opacity, 0 < model.initial_opacity < 1, "between 0 and 1"),

@@ -28,6 +28,8 @@ def test_the_numbers_of_presets_are_in_range(preset):
         ("seed", [-1, 2**31], [0, 2**31 - 1]),
         ("inbetweens", [-0.1, 1.0, float("nan")], [0.0, 0.9]),
         ("drop", [-0.1, 1.0], [0.0, 0.9]),
+        ("optim.cooldown", [-0.1, 1.1], [0.0, 1.0]),
+        ("model.shut_gates", [-0.1, 1.0], [0.0, 0.9]),
         ("model.plane_size", [1], [2]),
         ("model.time_size", [1], [2, None]),
         ("model.box_points", [0.0, 1.1], [0.01, 1.0]),
