@@ -65,8 +65,11 @@ def video(count: int, width: int, height: int, frames: int, *, in_file: bool = F
     return Dataset("cloud", width, height, split, split, arrays["means"])
 
 
-def fine_state(dataset: Dataset, config: Config) -> TrainState:
-    """The state at the start of the fine stage, with the `cloud` of a `video` as Gaussians and paths without motion."""
+def fine_state(dataset: Dataset, config: Config, moving_share: float = 1.0) -> TrainState:
+    """The state at the start of the fine stage, with the `cloud` of a `video` as Gaussians and paths without motion.
+
+    If there are motion gates, those of all but `moving_share` of the Gaussians, drawn at random, are shut.
+    """
     count, frames = len(dataset.points), len(dataset.train.names)
     arrays = cloud(count, dataset.width, dataset.height)
     # Tracks and surfaces found in noise would add Gaussians.
@@ -83,12 +86,17 @@ def fine_state(dataset: Dataset, config: Config) -> TrainState:
             paths=rows(jnp.zeros((count, path_knots(frames), 3))),
             lifetimes=rows(jnp.tile(jnp.array([0.0, 1.0]), (count, 1))),
         )
+    if gaussians.gate is not None:
+        shut = np.random.default_rng(2).uniform(size=gaussians.gate.shape) >= moving_share
+        gaussians = gaussians._replace(gate=jnp.where(shut, -np.inf, gaussians.gate))
     scene = scene._replace(params=scene.params._replace(gaussians=gaussians))
     return begin_stage(scene, jnp.asarray(config.coarse_steps, jnp.int32), config, config.fine_steps)
 
 
-def training(count: int, width: int, height: int, config: Config) -> tuple[TrainState, Batch]:
-    """A fine-stage state and a batch of noise to fit it to."""
+def training(
+    count: int, width: int, height: int, config: Config, moving_share: float = 1.0
+) -> tuple[TrainState, Batch]:
+    """A fine-stage state and a batch of noise to fit it to; for `moving_share` see `fine_state`."""
     dataset = video(count, width, height, frames=60)
     indices = np.linspace(0, len(dataset.train.names) - 1, config.batch_size).astype(int)
-    return fine_state(dataset, config), load_batch(dataset.train, indices)
+    return fine_state(dataset, config, moving_share), load_batch(dataset.train, indices)

@@ -107,9 +107,6 @@ class ModelConfig:
     # whether every Gaussian has a gate: a learned factor in (0, 1) on all that the motion field does to it
     motion_gate: bool = False
     shut_gates: float = 0.0  # a motion gate below this is shut for good: its Gaussian stands still
-    # with motion gates: share of the Gaussians that the motion field acts on, those with the widest open gates; in
-    # training they are drawn at random with the odds of their gates
-    moving_share: float = 1.0
     # whether moving objects start with Gaussians of their own, found by tracking optical flow (training/seeds.py); each
     # has a path and a lifetime, and the motion field acts on top of these
     tracks: bool = False
@@ -153,8 +150,6 @@ class ModelConfig:
     unit_exponent: Literal["b1", "b2"] | None = None  # the exponent that is fixed at 1 (Table 3, B1 = 1 and B2 = 1)
 
     def __post_init__(self) -> None:
-        if not 0 < self.moving_share <= 1:
-            raise UserError(f"--model.moving-share {self.moving_share}: expected more than 0 and at most 1")
         if self.domain == "light" and isinstance(self.tone, float | int):
             raise UserError(f"--model.tone {self.tone}: applies to sRGB values; expected --model.domain values or auto")
 

@@ -9,7 +9,7 @@ from jaxtyping import Shaped
 from l2dgs_jax.data.dataset import Split
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.model.decomposition import full_light
-from l2dgs_jax.model.deformation import acting, length_unit, openness
+from l2dgs_jax.model.deformation import length_unit, openness
 from l2dgs_jax.rasterizer.projection import NEAR_PLANE
 from l2dgs_jax.runs import Run
 
@@ -29,9 +29,8 @@ def model_arrays(run: Run) -> dict[str, Shaped[np.ndarray, "..."]]:
     params, alive = scene.params, np.asarray(scene.alive)
     gaussians = {name: rows for name, rows in params.gaussians._asdict().items() if rows is not None}
     if params.gaussians.gate is not None:
-        moved, open_gates = acting(scene, cfg), openness(params.gaussians.gate, cfg) > 0
-        acts = open_gates if moved is None else open_gates & (moved.places < len(moved.rows))
-        gaussians["gate"] = np.where(acts, params.gaussians.gate, -np.inf)
+        gate = params.gaussians.gate
+        gaussians["gate"] = np.where(openness(gate, cfg) > 0, gate, -np.inf)
     coefficients = [gaussians.pop("illumination_dc"), gaussians.pop("illumination_rest")]
     gaussians["illumination"] = np.concatenate(coefficients, axis=-1)[:, : (run.renderer().sh_degree + 1) ** 2]
     unit = length_unit(scene.extent, cfg)

@@ -1,6 +1,5 @@
 """Canonical Gaussians and instants -> Gaussians at those instants, lit as their cameras see them (Eqs. 1-4)."""
 
-import math
 from typing import NamedTuple
 
 import jax
@@ -24,7 +23,6 @@ def deform(
     moving: bool,
     sh_degree_active: Int[Array, ""] | int,
     presence: Float[Array, " N"] | None = None,
-    gate_noise: Float[Array, " N"] | None = None,
 ) -> MovedGaussians:
     """Move and light every Gaussian for V cameras, each at its own instant.
 
@@ -37,8 +35,6 @@ def deform(
         moving: whether the motion field and OCD-Net act (fine stage); otherwise only paths do, with a_j = 1.
         sh_degree_active: bands of Eq. 2 above this one are left out; may be traced.
         presence: factor on the opacities, which stay at most 1; None for 1.
-        gate_noise: added to the logits of the gates, only to select the Gaussians that the motion field acts on
-            (`cfg.moving_share`); None for 0.
 
     Returns:
         Activated Gaussians; every field has a leading axis V.
@@ -54,7 +50,7 @@ def deform(
     dc_and_rest = jnp.concatenate([gaussians.illumination_dc, gaussians.illumination_rest], axis=-1)
     coefficients = _active(dc_and_rest, cfg.sh_degree, sh_degree_active)[None]  # b_j of Eq. 2
     if moving:
-        changes = _changes(scene, gaussians, cameras, cfg, gate_noise)
+        changes = _changes(scene, gaussians, cameras, cfg)
         means += length_unit(scene.extent, cfg) * changes.motion.means
         quats += changes.motion.quats
         log_scales += _growth(changes.motion.log_scales, cfg)
@@ -87,24 +83,23 @@ class _Changes(NamedTuple):
     light: Float[Array, "V N J"] | None  # a_j - 1
 
 
-def _changes(
-    scene: Scene,
-    gaussians: Gaussians,
-    cameras: Camera,
-    cfg: ModelConfig,
-    gate_noise: Float[Array, " N"] | None,
-) -> _Changes:
+def _changes(scene: Scene, gaussians: Gaussians, cameras: Camera, cfg: ModelConfig) -> _Changes:
     """What the motion field changes in every Gaussian."""
-    gate, subset = gaussians.gate, acting(scene, cfg, gate_noise)
-    chosen = lambda rows: rows if subset is None else compaction.select(rows, subset, 0)
-    # The same features feed the heads and OCD-Net: Eqs. 1 and 4 name them both f.
-    field = hexplane.features(scene.params.hexplane, chosen(gaussians.means), scene.bounds, cameras.time, cfg)
-    hidden, motion = networks.apply_heads(scene.params.heads, field)
-    changes = _Changes(motion, networks.apply_ocd(scene.params.ocd, hidden) - 1 if cfg.ocd else None)
-    if gate is not None:
-        factor = openness(chosen(gate), cfg)
-        changes = jax.tree.map(lambda rows: factor.reshape(1, -1, *[1] * (rows.ndim - 2)) * rows, changes)
-    return changes if subset is None else jax.tree.map(lambda rows: compaction.expand(rows, subset, 1), changes)
+    params = scene.params
+
+    def changes(shared: tuple, rows: tuple) -> _Changes:
+        (planes, heads, ocd, bounds, times), (means, factor) = shared, rows
+        # The same features feed the heads and OCD-Net: Eqs. 1 and 4 name them both f.
+        hidden, motion = networks.apply_heads(heads, hexplane.features(planes, means, bounds, times, cfg))
+        full = _Changes(motion, networks.apply_ocd(ocd, hidden) - 1 if cfg.ocd else None)
+        if factor is None:
+            return full
+        return jax.tree.map(lambda change: factor.reshape(1, -1, *[1] * (change.ndim - 2)) * change, full)
+
+    factor = None if gaussians.gate is None else openness(gaussians.gate, cfg)
+    acts = scene.alive if factor is None else scene.alive & (factor > 0)
+    shared = (params.hexplane, params.heads, params.ocd, scene.bounds, cameras.time)
+    return compaction.map_chosen(changes, shared, (gaussians.means, factor), acts)
 
 
 def openness(gate: Float[Array, " N"], cfg: ModelConfig) -> Float[Array, " N"]:
@@ -121,15 +116,6 @@ def _growth(log_scales: Float[Array, "V N 3"], cfg: ModelConfig) -> Float[Array,
     if cfg.scale_growth == "exponential":
         return log_scales
     return jnp.log1p(jnp.maximum(log_scales, 0)) + jnp.minimum(log_scales, 0)
-
-
-def acting(scene: Scene, cfg: ModelConfig, gate_noise: Float[Array, " N"] | None = None) -> compaction.Subset | None:
-    """The Gaussians that the motion field acts on; None for all. For `gate_noise` see `deform`."""
-    gate = scene.params.gaussians.gate
-    if gate is None or cfg.moving_share == 1:
-        return None
-    scores = gate if gate_noise is None else gate + gate_noise
-    return compaction.highest(jnp.where(scene.alive, scores, -jnp.inf), math.ceil(cfg.moving_share * len(gate)))
 
 
 def _on_paths(

@@ -34,7 +34,6 @@ def render(
     pair_capacity: int | None,
     means2d_probe: Float[Array, "V N 2"] | None = None,
     presence: Float[Array, " N"] | None = None,
-    gate_noise: Float[Array, " N"] | None = None,
 ) -> RenderOutput:
     """Render V views, each at its own instant (Eqs. 1-9).
 
@@ -51,11 +50,8 @@ def render(
         pair_capacity: size of the rasterizer's pair buffer for all views; None only outside jit.
         means2d_probe: zeros whose gradient is dL/d(mean2d) in pixels.
         presence: see `deform`.
-        gate_noise: see `deform`.
     """
-    moved = deform(
-        scene, cameras, cfg, moving=moving, sh_degree_active=sh_degree, presence=presence, gate_noise=gate_noise
-    )
+    moved = deform(scene, cameras, cfg, moving=moving, sh_degree_active=sh_degree, presence=presence)
     drawn = rasterize(
         moved.means,
         moved.quats,

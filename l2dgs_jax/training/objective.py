@@ -69,7 +69,6 @@ def objective(
         pair_capacity=pair_capacity,
         means2d_probe=probe,
         presence=presence(state, config),
-        gate_noise=gate_noise(state, config),
     )
     cfg = config.loss
     start, steps = (config.coarse_steps, config.fine_steps) if moving else (0, config.coarse_steps)
@@ -142,18 +141,6 @@ def presence(state: TrainState, config: Config) -> Float[Array, " N"] | None:
     share = config.drop * state.step.astype(state.stats.seen.dtype) / config.steps
     key = jax.random.fold_in(randomness(state, config), 3)
     return jnp.where(jax.random.bernoulli(key, share, state.scene.alive.shape), 0, 1 / (1 - share))
-
-
-def gate_noise(state: TrainState, config: Config) -> Float[Array, " N"] | None:
-    """Gumbel noise for the logits of the gates, which randomises the Gaussians that the motion field acts on.
-
-    The highest sums are draws without replacement, in proportion to the odds of the gates (arXiv 1903.06059): gates
-    that have closed may open again.
-    """
-    if not (config.model.motion_gate and config.model.moving_share < 1):
-        return None
-    key = jax.random.fold_in(randomness(state, config), 4)
-    return jax.random.gumbel(key, state.scene.alive.shape, state.stats.seen.dtype)
 
 
 def exposed(

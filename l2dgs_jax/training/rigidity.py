@@ -1,7 +1,5 @@
 """How much neighbouring Gaussians that move change their distances: a prior that they move like parts of bodies."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
@@ -28,7 +26,7 @@ def rigidity(scene: Scene, cfg: ModelConfig, key: PRNGKeyArray) -> Float[Array, 
 
     Args:
         scene: the scene; one without motion gates is sampled evenly.
-        cfg: shape of the scene. All Gaussians that are drawn move, whatever `moving_share`.
+        cfg: shape of the scene.
         key: of the sample and the instants.
     """
     for_sample, for_first, for_span = jax.random.split(key, 3)
@@ -52,7 +50,7 @@ def rigidity(scene: Scene, cfg: ModelConfig, key: PRNGKeyArray) -> Float[Array, 
     moved = deform(
         scene._replace(params=scene.params._replace(gaussians=drawn), alive=scene.alive[subset.rows]),
         Camera(anywhere(4), anywhere(3), instants),  # motion does not depend on where the camera is
-        dataclasses.replace(cfg, moving_share=1.0),
+        cfg,
         moving=True,
         sh_degree_active=0,
     )

@@ -324,7 +324,6 @@ def test_what_cannot_start_leaves_no_folder(refuses, scene, tmp_path, monkeypatc
     option = "--optim.extent-scales"
     refuses(scene, option, "means", "plane", "--output", tmp_path / "run", naming=[option, "planes"])
     refuses(scene, "--density.spread=1", "--output", tmp_path / "run", naming=["--density.spread 1"])
-    refuses(scene, "--model.moving-share=0", "--output", tmp_path / "run", naming=["--model.moving-share 0"])
     tone = ("--model.domain", "light", "--model.tone", "1.2")
     refuses(scene, *tone, "--output", tmp_path / "run", naming=["--model.tone 1.2", "--model.domain values"])
     unlit = "--model.initial-illumination"

@@ -60,7 +60,7 @@ def test_models_that_the_documented_program_cannot_render_are_refused(run, part)
     [
         {},
         {"aggregation": "product", "box_rim": 0.2, "domain": "values", "relative_light": False, "bafe": True},
-        {"background": 0.7, "moving_share": 0.4, "domain": "light", "relative_light": True},
+        {"background": 0.7, "shut_gates": 0.5, "domain": "light", "relative_light": True},
     ],
 )
 def test_the_documented_program_renders_the_model(run, variant, tmp_path, monkeypatch):

@@ -277,40 +277,6 @@ def test_what_is_behind_a_shut_gate_stands_still_and_its_gate_stays_shut():
     np.testing.assert_array_equal(gradient != 0, ~shut)
 
 
-def test_with_a_moving_share_only_gaussians_with_the_largest_gates_move():
-    params, cameras = random_params(), views()
-    logits, largest = np.array([1.0, -3.0, 2.0, 0.5, -4.0, -1.0]), np.array([0, 2, 3])
-    alive = ALIVE.at[2].set(False)
-    part = dataclasses.replace(CFG, moving_share=0.5)
-    undeformed, all_moving, half_moving, one_dead, with_noise = (
-        deformed(gated(params, logits), cameras=cameras, moving=moving, cfg=cfg, **options)
-        for moving, cfg, options in (
-            (False, CFG, {}),
-            (True, CFG, {}),
-            (True, part, {}),
-            (True, part, {"alive": alive}),
-            (True, part, {"gate_noise": jnp.where(jnp.arange(N) % 2 == 1, 9.0, 0.0)}),
-        )
-    )
-    odd = np.array([1, 3, 5])
-    for moved, rows in ((half_moving, largest), (one_dead, np.array([0, 3, 5])), (with_noise, odd)):
-        rest = np.setdiff1d(np.arange(N), [*rows, 2])
-        for name in ("means", "quats", "scales", "illumination"):
-            value, full, none = (np.asarray(getattr(x, name)) for x in (moved, all_moving, undeformed))
-            np.testing.assert_allclose(value[:, rows], full[:, rows], atol=1e-12, err_msg=name)
-            np.testing.assert_allclose(value[:, rest], none[:, rest], atol=1e-12, err_msg=name)
-
-
-def test_gradients_with_a_moving_share():
-    part = dataclasses.replace(CFG, moving_share=0.5)
-    cameras, logits = views(), np.array([1.0, -3.0, 2.0, 0.5, -4.0, -1.0])
-
-    def f(params):
-        return deformed(params, cameras=cameras, moving=True, cfg=part)
-
-    check_grads(f, (gated(random_params(), logits),), 1, ["rev"], eps=1e-6)
-
-
 def test_motion_scales_with_the_unit_of_lengths():
     params, cameras = random_params(), views()
     offset = lambda cfg, extent: (

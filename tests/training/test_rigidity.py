@@ -127,12 +127,11 @@ def test_moving_gaussians_are_drawn_and_compared_at_two_near_instants(scene_and_
     monkeypatch.setattr(module, "DRAWN", int(scene.alive.sum()) // 3)
     gaps = []
     for seed in range(12):
-        value = rigidity(scene, dataclasses.replace(config, moving_share=0.5), jax.random.key(seed))
-        drawn, cameras, cfg, moved = calls[-1]
+        value = rigidity(scene, config, jax.random.key(seed))
+        drawn, cameras, _, moved = calls[-1]
         np.testing.assert_allclose(value, change(moved.means / scene.extent, moved.opacities), rtol=1e-9)
         assert value > 0
         assert np.all(drawn.params.gaussians.gate > 0)
-        assert cfg.moving_share == 1
         first, second = map(float, cameras.time)
         assert 0 <= first < second <= 1
         gaps.append(second - first)
