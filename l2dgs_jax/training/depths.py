@@ -1,5 +1,6 @@
 """Depths of tracks: as given, or of the nearest surface that an object hides; similar for tracks that move alike."""
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -16,12 +17,14 @@ from l2dgs_jax.training.tracks import DEPTH_CELL, Tracks
 NEIGHBOURS = 30  # nearest points of a pixel that depths are taken from
 STATIC_QUANTILES = 0.03, 0.97  # of their depths, between which static surfaces may lie: a few points are outliers
 CANDIDATES = 4  # depths in that range, evenly spaced in inverse depth
-BORDER = 20  # pixels beyond the image in which points still count
+BORDER = 0.13  # distance from the picture within which points still count, in sizes of the picture (see `_size`)
 NEIGHBOUR_RADIUS = 9.0  # pixels within which tracks may belong to one object
-VELOCITY_SIGMA = 0.3  # standard deviation, in pixels per frame, of velocities within one object
+VELOCITY_SIGMA = 0.002  # standard deviation of velocities within one object, in sizes of the picture per frame
+FLOW_SIGMA = 0.3  # that of optical flow, pixels per frame
 ALIKE = 0.5  # similarity of motion from which neighbours belong to one object
 STRIDE = 8  # frames before and after, over which a limb moves on average as the body that it swings about
-COLUMNS = 6  # pixels to either side of an observation in which what its object hides counts
+COLUMNS = 0.04  # distance to either side in which what an object hides counts, in sizes of the picture
+MIN_COLUMNS = 6.0  # at least this distance, pixels
 ON_GROUND = 0.8  # a surface is taken for the ground from this share of the depth at which the ground would be seen
 # Weights of squared differences of log-distances; the absolute error of the guess counts `TYPICAL_ERROR` times
 NEIGHBOUR_WEIGHT = 1.0  # between neighbours, times the similarity of their motion
@@ -55,7 +58,8 @@ def depths_around(
 ) -> Depths:
     """Depths in one frame, of points in world units."""
     pixels, depth = project_points(points, viewmat, K)
-    inside = ((pixels > -BORDER) & (pixels < (width + BORDER, height + BORDER))).all(-1)
+    border = BORDER * _size(height, width)
+    inside = ((pixels > -border) & (pixels < (width + border, height + border))).all(-1)
     rows, columns = (np.arange(0, size, DEPTH_CELL) + 0.5 * DEPTH_CELL for size in (height, width))
     if not inside.any():
         unknown = np.full((1 + CANDIDATES, len(rows), len(columns)), np.nan, np.float32)
@@ -101,14 +105,16 @@ def shared_depths(
     """
     lengths = [len(track.frames) for track in tracks]
     merged = Tracks(*(np.concatenate(parts) for parts in zip(*tracks, strict=True)))
-    pairs = _neighbours(merged)
-    similarity, on_average = (_similarity(pairs, tracks, reach) for reach in (0, STRIDE))
+    size = DEPTH_CELL * _size(*hidden.shape[1:])
+    pairs, sigma = _neighbours(merged), max(FLOW_SIGMA, VELOCITY_SIGMA * size)
+    similarity, on_average = (_similarity(pairs, tracks, reach, sigma) for reach in (0, STRIDE))
     per_depth = np.concatenate(horizontal)
     behind = np.concatenate([depths_at(track, hidden) for track in tracks])
     floats = behind < ON_GROUND * np.concatenate(ground)
     behind *= per_depth
+    width = max(MIN_COLUMNS, COLUMNS * size)
     nearest, of_body = (
-        _nearest_hidden(merged, behind, pairs[:, similar > ALIKE]) for similar in (similarity, on_average)
+        _nearest_hidden(merged, behind, pairs[:, similar > ALIKE], width) for similar in (similarity, on_average)
     )
     nearest = np.where(floats[nearest] & (behind[of_body] < behind[nearest]), of_body, nearest)
     told = per_depth * np.concatenate(given)
@@ -138,9 +144,9 @@ def shared_depths(
 
 
 def _nearest_hidden(
-    tracks: Tracks, behind: Float[np.ndarray, " O"], alike: Int[np.ndarray, "2 E"]
+    tracks: Tracks, behind: Float[np.ndarray, " O"], alike: Int[np.ndarray, "2 E"], width: float
 ) -> Int[np.ndarray, " O"]:
-    """For each observation, which one of its object, in the columns around, hides what is nearest.
+    """For each observation, which one of its object, up to `width` pixels to either side, hides what is nearest.
 
     An object is what pairs of observations of one frame connect. `behind` are distances, NaN where unknown.
     """
@@ -152,7 +158,7 @@ def _nearest_hidden(
     for group in _by_frame(tracks):
         group = group[np.argsort(objects[group], kind="stable")]
         for part in np.split(group, np.flatnonzero(np.diff(objects[group])) + 1):
-            around = np.abs(columns[part][:, None] - columns[part]) <= COLUMNS
+            around = np.abs(columns[part][:, None] - columns[part]) <= width
             nearest[part] = part[np.where(around, behind[part], np.inf).argmin(-1)]
     return nearest
 
@@ -169,11 +175,18 @@ def _neighbours(tracks: Tracks) -> Int[np.ndarray, "2 E"]:
     return np.concatenate([group[close(tracks.pixels[group])] for group in _by_frame(tracks)]).T
 
 
-def _similarity(pairs: Int[np.ndarray, "2 E"], tracks: Sequence[Tracks], reach: int) -> Float[np.ndarray, " E"]:
+def _size(height: int, width: int) -> float:
+    """The size of a picture: the side of a square of the same area."""
+    return math.sqrt(height * width)
+
+
+def _similarity(
+    pairs: Int[np.ndarray, "2 E"], tracks: Sequence[Tracks], reach: int, sigma: float
+) -> Float[np.ndarray, " E"]:
     """How similarly pairs of observations move, in (0, 1], on average over `reach` more frames before and after."""
     velocities = np.concatenate([_velocities(track.pixels, reach) for track in tracks])
     first, second = velocities[pairs]
-    return np.exp(-np.square(first - second).sum(-1) / (2 * VELOCITY_SIGMA**2))
+    return np.exp(-np.square(first - second).sum(-1) / (2 * sigma**2))
 
 
 def _velocities(pixels: Float[np.ndarray, "O 2"], reach: int) -> Float[np.ndarray, "O 2"]:

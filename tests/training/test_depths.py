@@ -72,6 +72,21 @@ def test_an_object_is_as_near_as_the_nearest_surface_that_it_hides():
     assert solved(apart, depths)[0].min() > 3.5
 
 
+@pytest.mark.parametrize("scale", [1, 2, 4])
+@pytest.mark.parametrize(("difference", "together"), [(0.3, True), (0.6, False)])
+def test_what_belongs_together_does_not_depend_on_the_size_of_the_picture(scale, difference, together):
+    side, middle = 160 * scale, 80 * scale
+    depths = np.full((FRAMES, side // DEPTH_CELL, side // DEPTH_CELL), 4.0, np.float32)
+    depths[:, middle // DEPTH_CELL + 4 :] = 2.0  # the ground that the lower half stands on
+    heights = np.arange(middle - 20 * scale, middle + 20 * scale, 4) + 2.0
+    faster = np.where(heights < middle, difference * scale, 0)
+    tracks = [
+        track(i, (middle - faster[i] * (FRAMES - 1) / 2, y), (faster[i] + scale, 0)) for i, y in enumerate(heights)
+    ]
+    upper = np.stack(solved(tracks, depths))[heights < middle - 8]
+    assert upper.max() < 2.1 if together else upper.min() > 3.5
+
+
 def test_an_upright_object_has_one_horizontal_distance():
     alike = [track(i, (4.5, 4.5 + 4 * i), (1, 0)) for i in range(3)]
     factors = np.array([[1.0], [0.9], [0.8]])
