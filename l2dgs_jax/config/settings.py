@@ -260,7 +260,7 @@ class DensityConfig:
     conserve_opacity: bool = False
     prune_opacity: Number = 0.005  # opacity below which a Gaussian is removed ("adaptive") or relocated ("mcmc")
     prune_above: Count = 0  # "adaptive": remove Gaussians only while there are more than this
-    # largest number of Gaussians, unless the scene starts with more; "auto": 0.6 to 1 per pixel of a frame, at most
+    # largest number of Gaussians, unless the scene starts with more; "auto": 0.6 to 1.5 per pixel of a frame, at most
     # 360,000
     max_gaussians: AutoCount = 360_000
     noise: Number = 5e5  # "mcmc": strength of the noise on centres of faint Gaussians, as a factor on means_lr

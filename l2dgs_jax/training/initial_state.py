@@ -21,8 +21,8 @@ from l2dgs_jax.training.state import TrainState
 from l2dgs_jax.training.step import begin_stage
 from l2dgs_jax.training.surfaces import find_surfaces
 
-GAUSSIANS_PER_PIXEL = (0.6, 1.0)  # of a frame: least and greatest, in between in proportion to the number of views
-VIEWS_PER_GAUSSIAN = 40  # needed for one Gaussian per pixel: with fewer views, as many Gaussians would fit noise
+GAUSSIANS_PER_PIXEL = (0.6, 1.5)  # of a frame: least and greatest, in between in proportion to the number of views
+VIEWS_PER_GAUSSIAN = 28  # needed for one Gaussian per pixel: with fewer views, as many Gaussians would fit noise
 MAX_GAUSSIANS = 360_000  # however large the frames
 EXPOSURE_DRIFT = 0.05  # standard deviation of the frames' log gains above which exposure counts as drifting
 
