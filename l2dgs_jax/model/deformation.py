@@ -84,7 +84,7 @@ class _Changes(NamedTuple):
 
 
 def _changes(scene: Scene, gaussians: Gaussians, cameras: Camera, cfg: ModelConfig) -> _Changes:
-    """What the motion field changes in every Gaussian."""
+    """What the motion field changes in every Gaussian: nothing in those behind shut gates, which take no time."""
     params = scene.params
 
     def changes(shared: tuple, rows: tuple) -> _Changes:
