@@ -1,6 +1,5 @@
 """Depths of tracks: as given, or of the nearest surface that an object hides; similar for tracks that move alike."""
 
-import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -17,13 +16,13 @@ from l2dgs_jax.training.tracks import DEPTH_CELL, Tracks
 NEIGHBOURS = 30  # nearest points of a pixel that depths are taken from
 STATIC_QUANTILES = 0.03, 0.97  # of their depths, between which static surfaces may lie: a few points are outliers
 CANDIDATES = 4  # depths in that range, evenly spaced in inverse depth
-BORDER = 0.13  # distance from the picture within which points still count, in sizes of the picture (see `_size`)
+BORDER = 0.1  # distance from the picture within which points still count, in focal lengths
 NEIGHBOUR_RADIUS = 9.0  # pixels within which tracks may belong to one object
-VELOCITY_SIGMA = 0.002  # standard deviation of velocities within one object, in sizes of the picture per frame
+VELOCITY_SIGMA = 0.0015  # standard deviation of velocities within one object, in focal lengths per frame
 FLOW_SIGMA = 0.3  # that of optical flow, pixels per frame
 ALIKE = 0.5  # similarity of motion from which neighbours belong to one object
 STRIDE = 8  # frames before and after, over which a limb moves on average as the body that it swings about
-COLUMNS = 0.04  # distance to either side in which what an object hides counts, in sizes of the picture
+COLUMNS = 0.03  # distance to either side in which what an object hides counts, in focal lengths
 MIN_COLUMNS = 6.0  # at least this distance, pixels
 ON_GROUND = 0.8  # a surface is taken for the ground from this share of the depth at which the ground would be seen
 # Weights of squared differences of log-distances; the absolute error of the guess counts `TYPICAL_ERROR` times
@@ -58,7 +57,7 @@ def depths_around(
 ) -> Depths:
     """Depths in one frame, of points in world units."""
     pixels, depth = project_points(points, viewmat, K)
-    border = BORDER * _size(height, width)
+    border = BORDER * K[0, 0]
     inside = ((pixels > -border) & (pixels < (width + border, height + border))).all(-1)
     rows, columns = (np.arange(0, size, DEPTH_CELL) + 0.5 * DEPTH_CELL for size in (height, width))
     if not inside.any():
@@ -83,6 +82,7 @@ def shared_depths(
     horizontal: Sequence[Float[np.ndarray, " _"]],
     ground: Sequence[Float[np.ndarray, " _"]],
     given: Sequence[Float[np.ndarray, " _"]],
+    focal_length: float,
 ) -> list[Float[np.ndarray, " O"]]:
     """Depths of all observations of the tracks, solved for jointly, world units.
 
@@ -102,17 +102,17 @@ def shared_depths(
         ground: of each track's observations, the depth at which the ground would be seen there, world units; NaN for
             all if it is unknown.
         given: of each track's observations, the depth that came with the scene, world units; NaN where unknown.
+        focal_length: of the cameras, pixels: how far apart and how fast things are is judged by angles.
     """
     lengths = [len(track.frames) for track in tracks]
     merged = Tracks(*(np.concatenate(parts) for parts in zip(*tracks, strict=True)))
-    size = DEPTH_CELL * _size(*hidden.shape[1:])
-    pairs, sigma = _neighbours(merged), max(FLOW_SIGMA, VELOCITY_SIGMA * size)
+    pairs, sigma = _neighbours(merged), max(FLOW_SIGMA, VELOCITY_SIGMA * focal_length)
     similarity, on_average = (_similarity(pairs, tracks, reach, sigma) for reach in (0, STRIDE))
     per_depth = np.concatenate(horizontal)
     behind = np.concatenate([depths_at(track, hidden) for track in tracks])
     floats = behind < ON_GROUND * np.concatenate(ground)
     behind *= per_depth
-    width = max(MIN_COLUMNS, COLUMNS * size)
+    width = max(MIN_COLUMNS, COLUMNS * focal_length)
     nearest, of_body = (
         _nearest_hidden(merged, behind, pairs[:, similar > ALIKE], width) for similar in (similarity, on_average)
     )
@@ -173,11 +173,6 @@ def _neighbours(tracks: Tracks) -> Int[np.ndarray, "2 E"]:
     """Pairs of observations that are close to each other in a frame."""
     close = lambda pixels: cKDTree(pixels).query_pairs(NEIGHBOUR_RADIUS, output_type="ndarray")
     return np.concatenate([group[close(tracks.pixels[group])] for group in _by_frame(tracks)]).T
-
-
-def _size(height: int, width: int) -> float:
-    """The size of a picture: the side of a square of the same area."""
-    return math.sqrt(height * width)
 
 
 def _similarity(

@@ -51,7 +51,9 @@ def find_seeds(points: Float[np.ndarray, "P 3"], split: Split, most: int) -> See
         return Seeds(*(np.zeros(shape, np.float32) for shape in shapes))
     hidden = np.stack([depths.hidden for depths in around])
     given = _given_depths(chosen, cameras, points, split)
-    depths = shared_depths(chosen, hidden, *_of_ground(chosen, cameras, find_ground(points, cameras.viewmat)), given)
+    ground = find_ground(points, cameras.viewmat)
+    focal_length = float(cameras.K[:, 0, 0].mean())
+    depths = shared_depths(chosen, hidden, *_of_ground(chosen, cameras, ground), given, focal_length)
     seeds = [_seed(split, cameras, weights, *track) for track in zip(chosen, depths, strict=True)]
     found = Seeds(*(np.array(rows, np.float32) for rows in zip(*seeds, strict=True)))
     order = z_order(found.points)

@@ -21,10 +21,10 @@ def cells(value=2.0):
     return np.full((FRAMES, HEIGHT // DEPTH_CELL, WIDTH // DEPTH_CELL), value, np.float32)
 
 
-def solved(tracks, hidden, factors=1.0, ground=np.nan, given=np.nan):
+def solved(tracks, hidden, factors=1.0, ground=np.nan, given=np.nan, focal_length=200.0):
     """Depths of tracks; the rest is the same for all, or has a row for each track or a column for each frame."""
     rest = (list(np.broadcast_to(value, (len(tracks), FRAMES))) for value in (factors, ground, given))
-    return shared_depths(tracks, hidden, *rest)
+    return shared_depths(tracks, hidden, *rest, focal_length)
 
 
 def test_depths_around_are_ordered_and_lie_within_those_of_the_points():
@@ -83,7 +83,7 @@ def test_what_belongs_together_does_not_depend_on_the_size_of_the_picture(scale,
     tracks = [
         track(i, (middle - faster[i] * (FRAMES - 1) / 2, y), (faster[i] + scale, 0)) for i, y in enumerate(heights)
     ]
-    upper = np.stack(solved(tracks, depths))[heights < middle - 8]
+    upper = np.stack(solved(tracks, depths, focal_length=200.0 * scale))[heights < middle - 8]
     assert upper.max() < 2.1 if together else upper.min() > 3.5
 
 
