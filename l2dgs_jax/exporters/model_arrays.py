@@ -28,9 +28,8 @@ def model_arrays(run: Run) -> dict[str, Shaped[np.ndarray, "..."]]:
             raise UserError(f"{run.name}: model.{name} is {getattr(cfg, name)}; expected {required} for this format")
     params, alive = scene.params, np.asarray(scene.alive)
     gaussians = {name: rows for name, rows in params.gaussians._asdict().items() if rows is not None}
-    if params.gaussians.gate is not None:
-        gate = params.gaussians.gate
-        gaussians["gate"] = np.where(openness(gate, cfg) > 0, gate, -np.inf)
+    if "gate" in gaussians:
+        gaussians["gate"] = np.where(openness(gaussians["gate"], cfg) > 0, gaussians["gate"], -np.inf)
     coefficients = [gaussians.pop("illumination_dc"), gaussians.pop("illumination_rest")]
     gaussians["illumination"] = np.concatenate(coefficients, axis=-1)[:, : (run.renderer().sh_degree + 1) ** 2]
     unit = length_unit(scene.extent, cfg)

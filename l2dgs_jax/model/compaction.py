@@ -31,9 +31,7 @@ class Subset(NamedTuple):
 
 def highest(scores: Float[Array, " N"], count: int) -> Subset:
     """The `count` rows that score highest."""
-    rows = jnp.sort(jax.lax.top_k(scores, count)[1])
-    places = jnp.full(scores.shape, count, rows.dtype).at[rows].set(jnp.arange(count, dtype=rows.dtype))
-    return Subset(rows, places)
+    return subset_of(jnp.zeros(len(scores), bool).at[jax.lax.top_k(scores, count)[1]].set(True), count)
 
 
 def subset_of(chosen: Bool[Array, " N"], size: int) -> Subset:
