@@ -73,8 +73,8 @@ def main() -> None:
 
 
 def slug(machine: dict[str, str | int]) -> str:
-    """Name of the machine's baseline."""
-    name = f"{machine['processor']} {machine['cores']} cores"
+    """Name of the machine's baseline: its accelerator, or else its processor and cores."""
+    name = f"{machine['processor']} {machine['cores']} cores" if machine["device"] == "cpu" else str(machine["device"])
     return re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")
 
 

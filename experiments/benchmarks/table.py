@@ -49,13 +49,27 @@ TABLES = {
         "compilation cache filled, fine stage": "compiling fine_cached_s",
     },
 }
+ACCELERATOR_TABLES = {
+    "GPU": {
+        "rasterizer, forward": "rasterizer 50k_800x450_forward_ms",
+        "with gradients": "rasterizer 50k_800x450_forward_backward_ms",
+        "10,000 Gaussians at 160x96, with gradients": "rasterizer 10k_160x96_forward_backward_ms",
+        "whole training step": "step 40k_400x225_ms",
+        "the motion field acting on a tenth of the Gaussians": "step 40k_400x225_tenth_moving_ms",
+        "parts of the step: HexPlane": "parts hexplane_ms",
+        "heads and OCD-Net": "parts heads_and_ocd_ms",
+        "rasterizer": "parts rasterizer_ms",
+        "BAFE-Net, in presets that have it": "parts bafe_ms",
+        "Adam": "parts adam_ms",
+    },
+}
 UNITS = {"_per_s": " a second", "_ms_per_million_pairs": " ms", "_ms": " ms", "_gib": " GiB", "_s": " s"}
 
 
 def markdown(title: str, figures: Figures) -> str:
-    """One of `TABLES`, as Markdown."""
+    """One of `TABLES` or `ACCELERATOR_TABLES`, as Markdown."""
     rows = ["| | |", "|---|---|"]
-    for label, where in TABLES[title].items():
+    for label, where in (TABLES | ACCELERATOR_TABLES)[title].items():
         case, name = where.split()
         rows.append(f"| {label} | {shown(name, figures[case][name])} |")
     return "".join(f"{row}\n" for row in rows)
@@ -84,8 +98,11 @@ def main(baseline: tyro.conf.Positional[Path]) -> None:
     Args:
         baseline: file that `run --update` has written.
     """
-    figures = json.loads(baseline.read_text())["figures"]
-    tables = {title: markdown(title, figures) for title in TABLES} | {"Larger scenes": larger_scenes(figures)}
+    report = json.loads(baseline.read_text())
+    figures, on_cpu = report["figures"], report["machine"]["device"] == "cpu"
+    tables = {title: markdown(title, figures) for title in (TABLES if on_cpu else ACCELERATOR_TABLES)}
+    if on_cpu:
+        tables["Larger scenes"] = larger_scenes(figures)
     sys.stdout.write("\n".join(f"## {title}\n\n{table}" for title, table in tables.items()))
 
 

@@ -8,7 +8,8 @@ import pytest
 from experiments.benchmarks import table
 
 ROOT = Path(__file__).parents[2]
-BASELINE = ROOT / "experiments" / "benchmarks" / "baselines" / "amd-epyc-2-cores.json"
+BASELINES = ROOT / "experiments" / "benchmarks" / "baselines"
+BASELINE = BASELINES / "amd-epyc-2-cores.json"
 
 
 @pytest.mark.parametrize(
@@ -27,9 +28,15 @@ def test_figures_are_rounded_and_have_their_unit(name, value, shown):
     assert table.shown(name, value) == shown
 
 
-@pytest.mark.parametrize("title", table.TABLES)
-def test_the_documentation_shows_what_was_measured(title):
-    figures = json.loads(BASELINE.read_text())["figures"]
+@pytest.mark.parametrize(
+    ("title", "baseline"),
+    [
+        *((title, "amd-epyc-2-cores") for title in table.TABLES),
+        *((title, "nvidia-h100-80gb-hbm3") for title in table.ACCELERATOR_TABLES),
+    ],
+)
+def test_the_documentation_shows_what_was_measured(title, baseline):
+    figures = json.loads((BASELINES / f"{baseline}.json").read_text())["figures"]
     assert table.markdown(title, figures) in (ROOT / "docs" / "speed.md").read_text()
 
 

@@ -7,7 +7,7 @@ import pytest
 from jax.test_util import check_grads
 
 from l2dgs_jax.kernels import use_kernels
-from l2dgs_jax.kernels.blend import accelerator, blend
+from l2dgs_jax.kernels.blend import blend, cpu
 from l2dgs_jax.kernels.tiles import TILE_SIZE, TileLists
 
 WIDTH, HEIGHT = 5 * TILE_SIZE - 3, 2 * TILE_SIZE
@@ -82,10 +82,10 @@ def test_every_form_matches_the_reference(any_way):
 
 @pytest.mark.parametrize("block", [3, 5])
 def test_full_and_partial_blocks_match_the_reference(monkeypatch, block):
-    monkeypatch.setattr(accelerator, "BLOCK_SIZE", block)
+    monkeypatch.setattr(cpu, "BLOCK_SIZE", block)
     packed, lists = case(seed=block)
     cotangent = jnp.ones((TILES, CHANNELS, TILE_SIZE * TILE_SIZE))
-    with use_kernels("accelerator"):
+    with use_kernels("cpu"):
         actual = jax.jit(lambda *arrays: with_gradient(*arrays))(packed, lists, cotangent)  # recompiled
     with use_kernels("reference"):
         expected = compiled(packed, lists, cotangent)
