@@ -62,10 +62,23 @@ def smooth_flow(
     smaller = (cv2.resize(picture, small, interpolation=cv2.INTER_AREA) for picture in (first, second))
     flow = cv2.optflow.createOptFlow_DeepFlow().calc(*smaller, None)  # type: ignore[call-overload]
     flow = cv2.resize(flow, (width, height)) * np.array([width, height], np.float32) / np.array(small, np.float32)
+    return refined(first, second, flow)
+
+
+def refined(
+    first: UInt8[np.ndarray, "H W"], second: UInt8[np.ndarray, "H W"], flow: Float32[np.ndarray, "H W 2"]
+) -> Float32[np.ndarray, "H W 2"]:
+    """The flow after variational refinement, which corrects errors of about a pixel."""
     refinement = cv2.VariationalRefinement.create()
     refinement.setFixedPointIterations(REFINEMENT_STEPS)
     refinement.setSorIterations(REFINEMENT_STEPS)
-    return refinement.calc(first, second, flow)
+    return refinement.calc(first, second, flow.copy())  # it overwrites its argument
+
+
+def warped(image: UInt8[np.ndarray, "H W"], flow: Float32[np.ndarray, "H W 2"]) -> Float32[np.ndarray, "H W"]:
+    """The image sampled at each pixel plus its flow."""
+    at = flow + pixel_indices(*image.shape)
+    return cv2.remap(image.astype(np.float32), at[..., 0], at[..., 1], cv2.INTER_LINEAR)
 
 
 def pixel_indices(height: int, width: int) -> Float32[np.ndarray, "H W 2"]:

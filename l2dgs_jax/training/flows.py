@@ -2,12 +2,12 @@
 
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 from jaxtyping import Float16, Float32, Int, UInt8
 
-from l2dgs_jax.cameras.flow import brightened, match, optical_flow, pixel_indices, smooth_flow
+from l2dgs_jax.cameras.flow import brightened, match, optical_flow, smooth_flow, warped
 from l2dgs_jax.cameras.geometry import camera_centres
+from l2dgs_jax.cameras.jumps import follow_jumps, unexplained
 from l2dgs_jax.data.dataset import Split
 from l2dgs_jax.data.stacks import MappedArray, stacked
 from l2dgs_jax.runtime.prefetch import prefetch
@@ -41,7 +41,7 @@ def neighbour_flows(split: Split, *, filled: bool = False) -> Flows:
 
     def both_directions(frame: int) -> Float16[np.ndarray, "2 H W 2"]:
         first, second = greys[frame], greys[following[frame]]
-        found = _consistent(optical_flow(first, second), optical_flow(second, first))
+        found = _with_jumps(first, second)
         for size in SMOOTH_FLOW_SIZES if filled else ():
             smooth = _consistent(smooth_flow(first, second, size), smooth_flow(second, first, size))
             found = np.where(np.isfinite(found), found, smooth)
@@ -68,6 +68,20 @@ def _following(cameras: Camera) -> Int[np.ndarray, " F"]:
     return np.array([after(frame) for frame in range(len(times))])
 
 
+def _with_jumps(first: UInt8[np.ndarray, "H W"], second: UInt8[np.ndarray, "H W"]) -> Float32[np.ndarray, "2 H W 2"]:
+    """The flow from either frame to the other, by patches; NaN where it is not to be trusted."""
+    pairs = (first, second), (second, first)
+    flows = [optical_flow(*pair) for pair in pairs]
+    found = _consistent(*flows)
+    lost = [unexplained(*pair, flow) for pair, flow in zip(pairs, found, strict=True)]
+    (far, jumps), (far_back, jumps_back) = (
+        follow_jumps(*pair, flow, where) for pair, flow, where in zip(pairs, flows, lost, strict=True)
+    )
+    with_jumps = _consistent(far, far_back)
+    explained = np.stack([~unexplained(*pair, flow) for pair, flow in zip(pairs, with_jumps, strict=True)])
+    return np.where((np.stack([jumps, jumps_back]) & explained)[..., None], with_jumps, found)
+
+
 def _consistent(
     forward: Float32[np.ndarray, "H W 2"], backward: Float32[np.ndarray, "H W 2"]
 ) -> Float32[np.ndarray, "2 H W 2"]:
@@ -85,7 +99,5 @@ def _explains(
     Forward-backward errors do not tell: smooth flow is consistent between any two frames, even across a cut.
     """
     known = np.isfinite(flow[..., 0])
-    at = np.where(known[..., None], flow, 0) + pixel_indices(*first.shape)
-    warped = cv2.remap(second.astype(np.float32), at[..., 0], at[..., 1], cv2.INTER_LINEAR)
-    residual = first - np.where(known, warped, first.mean())
+    residual = first - np.where(known, warped(second, np.nan_to_num(flow)), first.mean())
     return bool(known.any() and np.square(residual).mean() <= MAX_UNEXPLAINED * first.var())

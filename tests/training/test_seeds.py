@@ -75,6 +75,19 @@ def test_seeds_follow_and_cover_the_moving_square(frame):
     assert cv2.dilate(covered, np.ones((9, 9), np.uint8))[square > 0].mean() > 0.85
 
 
+@pytest.mark.parametrize("every", [3, 6])
+def test_what_moves_by_half_its_size_or_more_from_frame_to_frame_is_covered(every):
+    split, squares = filmed(block=True)
+    frames = np.arange(0, COUNT, every)
+    few = Split(split.names[::every], Camera(*(x[::every] for x in split.cameras)), split.images[::every])
+    seeds = find_seeds(surfaces(), few, MANY)
+    for index, frame in enumerate(frames):
+        columns, rows = np.clip(projected(seeds, few, index).astype(int), 0, [WIDTH - 1, HEIGHT - 1]).T
+        covered = np.zeros(squares[frame].shape, np.uint8)
+        covered[rows, columns] = 1
+        assert cv2.dilate(covered, np.ones((9, 9), np.uint8))[squares[frame]].mean() > 0.9
+
+
 def test_seeds_have_the_colours_of_the_moving_square():
     split, squares = filmed(block=True)
     shown = np.concatenate([image[square] for image, square in zip(split.images, squares, strict=True)])
