@@ -21,6 +21,7 @@ RADIUS = 40  # along x and y, within which a patch is looked for
 MIN_LOST = 0.4  # share of a patch that is lost
 MIN_CONTRAST = 6.0  # standard deviation of a patch, grey levels
 MIN_CORRELATION = 0.6
+MIN_JUMP = 7.0  # distance between where a patch is found and where the search from coarse to fine takes it
 MAX_RETURN = 1  # along x and y, by which the search back from a match may miss the patch
 MAX_OVER_MEDIAN, MARGIN = 6.0, 8.0  # residuals above this many medians plus so many grey levels are not explained
 
@@ -72,7 +73,7 @@ def follow_jumps(
         correlations[patch][better] = jump.correlation
         fast[patch][better] = jump.right, jump.down
     unlike = [cv2.blur(_residuals(one, other, candidate), (PATCH, PATCH)) for candidate in (slow, fast)]
-    jumps = (correlations > MIN_CORRELATION) & (lost | (unlike[1] < unlike[0]))
+    jumps = (np.linalg.norm(fast - slow, axis=-1) > MIN_JUMP) & (lost | (unlike[1] < unlike[0]))
 
     found = refined(one, other, np.where(jumps[..., None], fast, slow))
     if scale < 1:

@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float16, Float32, Int, UInt8
+from jaxtyping import Bool, Float16, Float32, Int, UInt8
 
 from l2dgs_jax.cameras.flow import brightened, match, optical_flow, smooth_flow, warped
 from l2dgs_jax.cameras.geometry import camera_centres
@@ -78,8 +78,15 @@ def _with_jumps(first: UInt8[np.ndarray, "H W"], second: UInt8[np.ndarray, "H W"
         follow_jumps(*pair, flow, where) for pair, flow, where in zip(pairs, flows, lost, strict=True)
     )
     with_jumps = _consistent(far, far_back)
-    explained = np.stack([~unexplained(*pair, flow) for pair, flow in zip(pairs, with_jumps, strict=True)])
-    return np.where((np.stack([jumps, jumps_back]) & explained)[..., None], with_jumps, found)
+    # Where the search from coarse to fine succeeds in one direction only, it is a jump, too.
+    either = jumps | _seen_from(far, jumps_back), jumps_back | _seen_from(far_back, jumps)
+    explained = [~unexplained(*pair, flow) for pair, flow in zip(pairs, with_jumps, strict=True)]
+    return np.where((np.stack(either) & np.stack(explained))[..., None], with_jumps, found)
+
+
+def _seen_from(flow: Float32[np.ndarray, "H W 2"], mask: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
+    """The mask of a frame, at the pixels of the frame from which the flow leads to it."""
+    return warped(mask.astype(np.uint8), flow) > 0.5
 
 
 def _consistent(
