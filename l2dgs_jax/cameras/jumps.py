@@ -21,7 +21,6 @@ RADIUS = 40  # along x and y, within which a patch is looked for
 MIN_LOST = 0.4  # share of a patch that is lost
 MIN_CONTRAST = 6.0  # standard deviation of a patch, grey levels
 MIN_CORRELATION = 0.6
-MIN_JUMP = 7.0  # distance between where a patch is found and where the search from coarse to fine takes it
 MAX_RETURN = 1  # along x and y, by which the search back from a match may miss the patch
 MAX_OVER_MEDIAN, MARGIN = 6.0, 8.0  # residuals above this many medians plus so many grey levels are not explained
 
@@ -49,6 +48,7 @@ def follow_jumps(
     second: UInt8[np.ndarray, "H W"],
     flow: Float32[np.ndarray, "H W 2"],
     lost: Bool[np.ndarray, "H W"],
+    shortest: float,
 ) -> tuple[Float32[np.ndarray, "H W 2"], Bool[np.ndarray, "H W"]]:
     """The flow to the second frame with jumps, and where there are any: where patches were found that explain more.
 
@@ -57,6 +57,8 @@ def follow_jumps(
         second: brightened frame.
         flow: to the second frame, from a search from coarse to fine.
         lost: where it is not to be trusted.
+        shortest: how far from where `flow` takes it a patch must be found, pixels of frames whose longest side is
+            `LONGEST_SIDE` or less.
     """
     height, width = first.shape
     scale = min(LONGEST_SIDE / max(height, width), 1.0)
@@ -73,7 +75,8 @@ def follow_jumps(
         correlations[patch][better] = jump.correlation
         fast[patch][better] = jump.right, jump.down
     unlike = [cv2.blur(_residuals(one, other, candidate), (PATCH, PATCH)) for candidate in (slow, fast)]
-    jumps = (np.linalg.norm(fast - slow, axis=-1) > MIN_JUMP) & (lost | (unlike[1] < unlike[0]))
+    jumps = (correlations > MIN_CORRELATION) & (np.linalg.norm(fast - slow, axis=-1) >= shortest)
+    jumps &= lost | (unlike[1] < unlike[0])
 
     found = refined(one, other, np.where(jumps[..., None], fast, slow))
     if scale < 1:

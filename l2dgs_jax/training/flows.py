@@ -14,6 +14,9 @@ from l2dgs_jax.runtime.prefetch import prefetch
 from l2dgs_jax.types import Camera
 
 SMOOTH_FLOW_SIZES = 0.5, 0.25, 0.125  # of downscaled frames, in which smooth flow finds what patches lose
+# Pixels, see `follow_jumps`. Patches at outlines are found a little beside their place, which harms tracks. Views in
+# between are not harmed: there, pixels that are wrong are found out.
+MIN_JUMP = 7.0
 MAX_FORWARD_BACKWARD_ERROR = 1.5  # pixels; flow of a larger error is not trusted
 MAX_UNEXPLAINED = 0.8  # share of a frame's variance that warping the other may leave; more means a cut between them
 
@@ -35,13 +38,14 @@ def neighbour_flows(split: Split, *, filled: bool = False) -> Flows:
 
     Args:
         split: the frames.
-        filled: whether smooth flow, at smaller and smaller sizes, fills in where patches find no flow to trust.
+        filled: whether jumps may be short, and smooth flow, at smaller and smaller sizes, fills in where patches find
+            no flow to trust.
     """
     following, greys = _following(split.cameras), brightened(split.images)
 
     def both_directions(frame: int) -> Float16[np.ndarray, "2 H W 2"]:
         first, second = greys[frame], greys[following[frame]]
-        found = _with_jumps(first, second)
+        found = _with_jumps(first, second, 0.0 if filled else MIN_JUMP)
         for size in SMOOTH_FLOW_SIZES if filled else ():
             smooth = _consistent(smooth_flow(first, second, size), smooth_flow(second, first, size))
             found = np.where(np.isfinite(found), found, smooth)
@@ -68,14 +72,16 @@ def _following(cameras: Camera) -> Int[np.ndarray, " F"]:
     return np.array([after(frame) for frame in range(len(times))])
 
 
-def _with_jumps(first: UInt8[np.ndarray, "H W"], second: UInt8[np.ndarray, "H W"]) -> Float32[np.ndarray, "2 H W 2"]:
+def _with_jumps(
+    first: UInt8[np.ndarray, "H W"], second: UInt8[np.ndarray, "H W"], shortest: float
+) -> Float32[np.ndarray, "2 H W 2"]:
     """The flow from either frame to the other, by patches; NaN where it is not to be trusted."""
     pairs = (first, second), (second, first)
     flows = [optical_flow(*pair) for pair in pairs]
     found = _consistent(*flows)
     lost = [unexplained(*pair, flow) for pair, flow in zip(pairs, found, strict=True)]
     (far, jumps), (far_back, jumps_back) = (
-        follow_jumps(*pair, flow, where) for pair, flow, where in zip(pairs, flows, lost, strict=True)
+        follow_jumps(*pair, flow, where, shortest) for pair, flow, where in zip(pairs, flows, lost, strict=True)
     )
     with_jumps = _consistent(far, far_back)
     # Where the search from coarse to fine succeeds in one direction only, it is a jump, too.

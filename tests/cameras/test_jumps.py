@@ -29,9 +29,9 @@ def frames(right, down, scale=1, seed=0):
         yield np.clip(frame, 0, 255).astype(np.uint8)
 
 
-def followed(first, second):
+def followed(first, second, shortest=0.0):
     flow = optical_flow(first, second)
-    return flow, *follow_jumps(first, second, flow, unexplained(first, second, flow))
+    return flow, *follow_jumps(first, second, flow, unexplained(first, second, flow), shortest)
 
 
 @pytest.mark.parametrize("scale", [1, 3])
@@ -53,6 +53,15 @@ def test_where_flow_follows_there_are_no_jumps():
     assert np.abs(found - flow).mean() < 0.1
 
 
+def test_jumps_have_the_length_asked_for():
+    first, second = frames(20, -7)
+    flow, found, jumps = followed(first, second, shortest=15.0)
+    inner = np.s_[ROW + 3 : ROW + SIDE - 3, COLUMN + 3 : COLUMN + SIDE - 3]
+    assert jumps[inner].all()
+    assert np.linalg.norm(found - flow, axis=-1)[jumps].min() > 10
+    assert not followed(first, second, shortest=40.0)[2].any()
+
+
 def test_what_appears_is_not_found():
     rng = np.random.default_rng(3)
     first, second = (np.ascontiguousarray(x) for x in frames(0, 0))
@@ -65,7 +74,7 @@ def test_what_appears_is_not_found():
 def test_frames_that_have_nothing_in_common_or_are_smaller_than_a_patch(shape):
     first, second = np.random.default_rng(0).integers(0, 255, (2, *shape), np.uint8)
     everywhere = np.ones(shape, bool)
-    found, jumps = follow_jumps(first, second, np.zeros((*shape, 2), np.float32), everywhere)
+    found, jumps = follow_jumps(first, second, np.zeros((*shape, 2), np.float32), everywhere, 0.0)
     assert np.isfinite(found).all()
     assert jumps.mean() < 0.05
 
