@@ -64,28 +64,34 @@ def projected(seeds, split, frame):
     return (local @ K.T)[:, :2] / local[:, 2:]
 
 
+def places(seeds, split, frame):
+    """Rows and columns of the pixels to which they project, those outside moved to the border."""
+    columns, rows = np.clip(projected(seeds, split, frame).astype(int), 0, [WIDTH - 1, HEIGHT - 1]).T
+    return rows, columns
+
+
+def covered_share(square, places):
+    """Share of the square's pixels that lie within four pixels of one of the places."""
+    covered = np.zeros(square.shape, np.uint8)
+    covered[places] = 1
+    return cv2.dilate(covered, np.ones((9, 9), np.uint8))[square].mean()
+
+
 @pytest.mark.parametrize("frame", [2, 6, 11])
 def test_seeds_follow_and_cover_the_moving_square(frame):
     split, squares = filmed(block=True)
-    columns, rows = np.clip(projected(found(), split, frame).astype(int), 0, [WIDTH - 1, HEIGHT - 1]).T
-    square = squares[frame].astype(np.uint8)
-    assert cv2.dilate(square, np.ones((9, 9), np.uint8))[rows, columns].mean() > 0.85
-    covered = np.zeros_like(square)
-    covered[rows, columns] = 1
-    assert cv2.dilate(covered, np.ones((9, 9), np.uint8))[square > 0].mean() > 0.85
+    at = places(found(), split, frame)
+    assert cv2.dilate(squares[frame].astype(np.uint8), np.ones((9, 9), np.uint8))[at].mean() > 0.85
+    assert covered_share(squares[frame], at) > 0.85
 
 
 @pytest.mark.parametrize("every", [3, 6])
 def test_what_moves_by_half_its_size_or_more_from_frame_to_frame_is_covered(every):
     split, squares = filmed(block=True)
-    frames = np.arange(0, COUNT, every)
     few = Split(split.names[::every], Camera(*(x[::every] for x in split.cameras)), split.images[::every])
     seeds = find_seeds(surfaces(), few, MANY)
-    for index, frame in enumerate(frames):
-        columns, rows = np.clip(projected(seeds, few, index).astype(int), 0, [WIDTH - 1, HEIGHT - 1]).T
-        covered = np.zeros(squares[frame].shape, np.uint8)
-        covered[rows, columns] = 1
-        assert cv2.dilate(covered, np.ones((9, 9), np.uint8))[squares[frame]].mean() > 0.9
+    for index, square in enumerate(squares[::every]):
+        assert covered_share(square, places(seeds, few, index)) > 0.9
 
 
 def test_seeds_have_the_colours_of_the_moving_square():
