@@ -61,6 +61,9 @@ ACCELERATOR_TABLES = {
         "rasterizer": "parts rasterizer_ms",
         "BAFE-Net, in presets that have it": "parts bafe_ms",
         "Adam": "parts adam_ms",
+        "rendering well-lit frames": "rendering welllit_frames_per_s",
+        "the same, where a tenth of the Gaussians move": "rendering tenth_moving_welllit_frames_per_s",
+        "one at a time, all moving": "rendering welllit_one_at_a_time_frames_per_s",
     },
 }
 UNITS = {"_per_s": " a second", "_ms_per_million_pairs": " ms", "_ms": " ms", "_gib": " GiB", "_s": " s"}
