@@ -24,7 +24,7 @@ ALIKE = 0.5  # similarity of motion from which neighbours belong to one object
 STRIDE = 8  # frames before and after, over which a limb moves on average as the body that it swings about
 COLUMNS = 0.03  # distance to either side in which what an object hides counts, in focal lengths
 MIN_COLUMNS = 6.0  # at least this distance, pixels
-ON_GROUND = 0.8  # a surface is taken for the ground from this share of the depth at which the ground would be seen
+ON_GROUND = 0.8  # a surface is taken for the ground from this share of the ground's depth there up to its inverse
 # Weights of squared differences of log-distances; the absolute error of the guess counts `TYPICAL_ERROR` times
 NEIGHBOUR_WEIGHT = 1.0  # between neighbours, times the similarity of their motion
 CURVATURE_WEIGHT = 1000.0  # second differences along a track
@@ -88,11 +88,12 @@ def shared_depths(
 
     Solved for are horizontal distances, because they are the same for all parts of an upright object. Where no depth is
     given, the first guess is the nearest that the object hides: most objects stand on something, which is what their
-    lowest part hides. A trunk on swinging legs seems to be an object by itself that hides what is far behind it. Hence,
-    where the nearest that an object hides is not the ground, whatever moves alike on average over a longer time belongs
-    to it too; if that does not reach the ground either, the object may be nearer than the guess at little cost. The
-    guess is also wrong where only the upper part is in view, or what seems to be one object is several; so the solution
-    may depart from it, and changes smoothly along a track and between neighbours that move alike.
+    lowest part hides. If this is the ground, its plane tells the distance better than the points around. A trunk on
+    swinging legs seems to be an object by itself that hides what is far behind it. Hence, where the nearest that an
+    object hides is not the ground, whatever moves alike on average over a longer time belongs to it too; if that does
+    not reach the ground either, the object may be nearer than the guess at little cost. The guess is also wrong where
+    only the upper part is in view, or what seems to be one object is several; so the solution may depart from it, and
+    changes smoothly along a track and between neighbours that move alike.
 
     Args:
         tracks: at least one, each with at least one observation in a cell of known depth.
@@ -109,9 +110,9 @@ def shared_depths(
     pairs, sigma = _neighbours(merged), max(FLOW_SIGMA, VELOCITY_SIGMA * focal_length)
     similarity, on_average = (_similarity(pairs, tracks, reach, sigma) for reach in (0, STRIDE))
     per_depth = np.concatenate(horizontal)
-    behind = np.concatenate([depths_at(track, hidden) for track in tracks])
-    floats = behind < ON_GROUND * np.concatenate(ground)
-    behind *= per_depth
+    behind, level = np.concatenate([depths_at(track, hidden) for track in tracks]), np.concatenate(ground)
+    floats = behind < ON_GROUND * level
+    behind = per_depth * np.where(~floats & (behind < level / ON_GROUND), level, behind)
     width = max(MIN_COLUMNS, COLUMNS * focal_length)
     nearest, of_body = (
         _nearest_hidden(merged, behind, pairs[:, similar > ALIKE], width) for similar in (similarity, on_average)

@@ -102,6 +102,12 @@ def test_what_an_object_hides_in_distant_columns_does_not_count():
     assert found[-1].max() < 3 < found[0].min()
 
 
+def test_an_object_on_the_ground_is_as_far_away_as_its_plane_not_as_the_points_around():
+    body = [track(i, (4.5, 4.5 + 4 * i), (1, 0)) for i in range(3)]
+    (*_, foot) = solved(body, cells(2.2), ground=np.array([[np.inf], [4.0], [2.0]]))
+    assert_allclose(foot, 2, rtol=1e-3)
+
+
 def test_a_trunk_before_a_wall_is_drawn_to_the_leg_that_reaches_the_ground():
     depths = cells(4.0)
     depths[:, 4:] = 2.0
