@@ -71,12 +71,16 @@ def collect(studies: Sequence[Path]) -> Found:
 
 
 def _kept(path: Path) -> list[dict[str, Any]]:
-    """The rows of a file; a row can refer to another file beside it, by its name and the index of a row there."""
+    """The rows of a file; a row can refer to another file beside it.
+
+    It names that file, the index of a row there and, unless it takes all, the scenes that it takes from that row.
+    """
     rows = json.loads(path.read_text())
     for row in rows:
         if isinstance(row["scenes"], list):
-            name, index = row["scenes"]
-            row["scenes"] = _kept(path.parent / name)[index]["scenes"]
+            name, index, *chosen = row["scenes"]
+            scenes = _kept(path.parent / name)[index]["scenes"]
+            row["scenes"] = {scene: scenes[scene] for scene in chosen or scenes}
     return rows
 
 
