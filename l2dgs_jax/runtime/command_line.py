@@ -36,7 +36,13 @@ def run(
     try:
         with warnings.catch_warnings():
             warnings.showwarning = _show_warning  # type: ignore[assignment]
-            command(sys.argv[1:] if arguments is None else arguments)
+            try:
+                command(sys.argv[1:] if arguments is None else arguments)
+            finally:
+                sys.stdout.flush()
+    except BrokenPipeError:  # whatever reads the output, such as `head`, has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes once more when it ends
+        sys.exit(128 + signal.SIGPIPE)
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(error.code)

@@ -59,25 +59,15 @@ def find_tracks(split: Split, flows: Flows, depths: Float32[np.ndarray, "C F h w
     greys = brightened(split.images)
     pixels = pixel_indices(height, width) + np.float32(0.5)
     grid = pixels[SPACING // 2 :: SPACING, SPACING // 2 :: SPACING].reshape(-1, 2).astype(np.float64)
-
-    def cell(pixels: Float[np.ndarray, "N 2"]) -> Int[np.ndarray, " N"]:
-        column, row = (pixels // SPACING).astype(int).T
-        return row * width + column
-
     none = _Heads(np.zeros(0, int), np.zeros((0, 2)), np.zeros(0))
     arrived: dict[int, list[_Heads]] = {frame: [none] for frame in range(len(times))}
     observed, count = [], 0
     for frame in np.argsort(times, kind="stable").tolist():
-        heads = _Heads(*(np.concatenate(parts) for parts in zip(*arrived.pop(frame), strict=True)))
-        order = np.argsort(-heads.deviations, kind="stable")
-        first = order[np.unique(cell(heads.pixels[order]), return_index=True)[1]]
-        heads = _Heads(*(x[first] for x in heads))
+        heads = _foremost(_joined(arrived.pop(frame)), width)
         following = int(flows.following[frame])
         if following == frame:
-            unmoved = np.zeros(len(heads.numbers), bool)
-            observed.append(Tracks(heads.numbers, np.full(len(unmoved), frame), heads.pixels, unmoved))
+            observed.append(_seen(heads, frame, np.zeros((height, width), bool)))
             continue
-
         geometry = epipolar_geometry(split.cameras, frame, following)
         inverse_depths = 1 / depths[:, frame].repeat(DEPTH_CELL, 1).repeat(DEPTH_CELL, 2)[:, :height, :width]
         static = [project(geometry, pixels, inverse).astype(np.float32) for inverse in inverse_depths]
@@ -85,21 +75,46 @@ def find_tracks(split: Split, flows: Flows, depths: Float32[np.ndarray, "C F h w
         deviations, moves = _moving(greys[frame], greys[following], static, pixels + flow)
         if split.valid is not None:
             moves &= split.valid[frame]
-        fresh = grid[_at(moves, grid) & ~np.isin(cell(grid), cell(heads.pixels))]
-        numbers = count + np.arange(len(fresh))
+        fresh = grid[_at(moves, grid) & ~np.isin(_cells(grid, width), _cells(heads.pixels, width))]
+        heads = _joined([heads, _Heads(count + np.arange(len(fresh)), fresh, np.zeros(len(fresh)))])
         count += len(fresh)
-        heads = _Heads(*(np.concatenate(x) for x in zip(heads, (numbers, fresh, np.zeros(len(fresh))), strict=True)))
-        seen = np.full(len(heads.numbers), frame), heads.pixels, _at(moves, heads.pixels)
-        observed.append(Tracks(heads.numbers, *seen))
-
-        ends = heads.pixels + _at(flow, heads.pixels)
-        inside = ((ends >= 0) & (ends < (width, height))).all(-1)  # not where flow is NaN
-        latest = np.nan_to_num(_at(deviations, heads.pixels))
-        average = (1 - UPDATE_WEIGHT) * heads.deviations + UPDATE_WEIGHT * latest
-        arrived[following].append(_Heads(heads.numbers[inside], ends[inside], average[inside]))
+        observed.append(_seen(heads, frame, moves))
+        arrived[following].append(_carried(heads, flow, deviations))
     merged = Tracks(*(np.concatenate(parts) for parts in zip(*observed, strict=True)))
     order = np.lexsort((times[merged.frames], merged.numbers))
     return Tracks(*(x[order] for x in merged))
+
+
+def _joined(heads: Sequence[_Heads]) -> _Heads:
+    return _Heads(*(np.concatenate(parts) for parts in zip(*heads, strict=True)))
+
+
+def _cells(pixels: Float[np.ndarray, "N 2"], width: int) -> Int[np.ndarray, " N"]:
+    """Numbers of the cells that pixels of a frame of that width lie in."""
+    column, row = (pixels // SPACING).astype(int).T
+    return row * width + column
+
+
+def _foremost(heads: _Heads, width: int) -> _Heads:
+    """The one in each cell that deviates most."""
+    order = np.argsort(-heads.deviations, kind="stable")
+    first = order[np.unique(_cells(heads.pixels[order], width), return_index=True)[1]]
+    return _Heads(*(x[first] for x in heads))
+
+
+def _seen(heads: _Heads, frame: int, moves: Bool[np.ndarray, "H W"]) -> Tracks:
+    """Observations of the tracks in a frame whose pixels move or not."""
+    return Tracks(heads.numbers, np.full(len(heads.numbers), frame), heads.pixels, _at(moves, heads.pixels))
+
+
+def _carried(heads: _Heads, flow: Float32[np.ndarray, "H W 2"], deviations: Float32[np.ndarray, "H W"]) -> _Heads:
+    """Those that the flow carries to a place in the following frame; it is NaN where it is not to be trusted."""
+    ends = heads.pixels + _at(flow, heads.pixels)
+    height, width = deviations.shape
+    inside = ((ends >= 0) & (ends < (width, height))).all(-1)  # not where flow is NaN
+    latest = np.nan_to_num(_at(deviations, heads.pixels))
+    average = (1 - UPDATE_WEIGHT) * heads.deviations + UPDATE_WEIGHT * latest
+    return _Heads(heads.numbers[inside], ends[inside], average[inside])
 
 
 def _moving(

@@ -1,5 +1,6 @@
 """`l2dgs COMMAND` and `python -m l2dgs_jax.COMMAND`."""
 
+import signal
 import subprocess
 import sys
 import warnings
@@ -57,3 +58,12 @@ def test_a_warning_is_printed_as_one_sentence(capsys):
 
     command_line.run(command, [])
     assert capsys.readouterr().err == "warning: it is slow\n"
+
+
+def test_a_reader_that_has_seen_enough_ends_the_program_without_a_word():
+    for command in ("evaluate", "train"):
+        arguments = [sys.executable, "-m", f"l2dgs_jax.{command}", "--help"]
+        with subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as program:
+            program.stdout.close()  # before anything is written
+            assert program.stderr.read() == b""
+        assert program.returncode == 128 + signal.SIGPIPE
