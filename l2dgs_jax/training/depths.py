@@ -11,7 +11,8 @@ from scipy.sparse.linalg import cg
 from scipy.spatial import cKDTree
 
 from l2dgs_jax.cameras.geometry import project_points
-from l2dgs_jax.training.tracks import DEPTH_CELL, Tracks
+from l2dgs_jax.training.parallax import parallax_terms, windows
+from l2dgs_jax.training.tracks import DEPTH_CELL, Tracks, by_track
 
 NEIGHBOURS = 30  # nearest points of a pixel that depths are taken from
 STATIC_QUANTILES = 0.03, 0.97  # of their depths, between which static surfaces may lie: a few points are outliers
@@ -48,6 +49,28 @@ class Depths(NamedTuple):
     hidden: Float32[np.ndarray, "*F h w"]
 
 
+class Sights(NamedTuple):
+    """What cameras and scene tell about each of O observations; depths are NaN where they are unknown.
+
+    Attributes:
+        times: at which they are made.
+        centres: of the cameras, world units.
+        rays: from there through the pixels, per unit of depth.
+        horizontal: distance per unit of depth, positive; 1 for all if it is unknown where up is.
+        hidden: depth of the surface that something there would hide, world units.
+        ground: depth at which the ground would be seen there, world units.
+        given: depth that came with the scene, world units.
+    """
+
+    times: Float[np.ndarray, " O"]
+    centres: Float[np.ndarray, "O 3"]
+    rays: Float[np.ndarray, "O 3"]
+    horizontal: Float[np.ndarray, " O"]
+    hidden: Float[np.ndarray, " O"]
+    ground: Float[np.ndarray, " O"]
+    given: Float[np.ndarray, " O"]
+
+
 def depths_around(
     points: Float[np.ndarray, "P 3"],
     viewmat: Float[np.ndarray, "4 4"],
@@ -76,14 +99,7 @@ def depths_at(tracks: Tracks, depths: Float32[np.ndarray, "F h w"]) -> Float32[n
     return depths[tracks.frames, rows, columns]
 
 
-def shared_depths(
-    tracks: Sequence[Tracks],
-    hidden: Float32[np.ndarray, "F h w"],
-    horizontal: Sequence[Float[np.ndarray, " _"]],
-    ground: Sequence[Float[np.ndarray, " _"]],
-    given: Sequence[Float[np.ndarray, " _"]],
-    focal_length: float,
-) -> list[Float[np.ndarray, " O"]]:
+def shared_depths(tracks: Tracks, sights: Sights, focal_length: float) -> Float[np.ndarray, " O"]:
     """Depths of all observations of the tracks, solved for jointly, world units.
 
     Solved for are horizontal distances, because they are the same for all parts of an upright object. Where no depth is
@@ -92,33 +108,25 @@ def shared_depths(
     swinging legs seems to be an object by itself that hides what is far behind it. Hence, where the nearest that an
     object hides is not the ground, whatever moves alike on average over a longer time belongs to it too; if that does
     not reach the ground either, the object may be nearer than the guess at little cost. The guess is also wrong where
-    only the upper part is in view, or what seems to be one object is several; so the solution may depart from it, and
-    changes smoothly along a track and between neighbours that move alike.
+    only the upper part is in view, or what seems to be one object is several; so the solution may depart from it, as
+    far as parallax tells, and changes smoothly along a track and between neighbours that move alike.
 
     Args:
-        tracks: at least one, each with at least one observation in a cell of known depth.
-        hidden: depths of the cells, NaN where unknown.
-        horizontal: of each track's observations, the horizontal distance per unit of depth, positive; 1 for all if it
-            is unknown where up is.
-        ground: of each track's observations, the depth at which the ground would be seen there, world units; NaN for
-            all if it is unknown.
-        given: of each track's observations, the depth that came with the scene, world units; NaN where unknown.
+        tracks: at least one observation, and at least one in a cell of known depth.
+        sights: what cameras and scene tell about them.
         focal_length: of the cameras, pixels: how far apart and how fast things are is judged by angles.
     """
-    lengths = [len(track.frames) for track in tracks]
-    merged = Tracks(*(np.concatenate(parts) for parts in zip(*tracks, strict=True)))
-    pairs, sigma = _neighbours(merged), max(FLOW_SIGMA, VELOCITY_SIGMA * focal_length)
+    pairs, sigma = _neighbours(tracks), max(FLOW_SIGMA, VELOCITY_SIGMA * focal_length)
     similarity, on_average = (_similarity(pairs, tracks, reach, sigma) for reach in (0, STRIDE))
-    per_depth = np.concatenate(horizontal)
-    behind, level = np.concatenate([depths_at(track, hidden) for track in tracks]), np.concatenate(ground)
+    per_depth, behind, level = sights.horizontal, sights.hidden, sights.ground
     floats = behind < ON_GROUND * level
     behind = per_depth * np.where(~floats & (behind < level / ON_GROUND), level, behind)
     width = max(MIN_COLUMNS, COLUMNS * focal_length)
     nearest, of_body = (
-        _nearest_hidden(merged, behind, pairs[:, similar > ALIKE], width) for similar in (similarity, on_average)
+        _nearest_hidden(tracks, behind, pairs[:, similar > ALIKE], width) for similar in (similarity, on_average)
     )
     nearest = np.where(floats[nearest] & (behind[of_body] < behind[nearest]), of_body, nearest)
-    told = per_depth * np.concatenate(given)
+    told = per_depth * sights.given
     is_told = np.isfinite(told)
     guess = np.log(np.where(is_told, told, behind[nearest]))
     known = np.isfinite(guess)
@@ -126,8 +134,7 @@ def shared_depths(
     one_sided = floats[nearest] & ~is_told
     guess = np.where(known, guess, guess[known].mean())
 
-    owner = np.repeat(np.arange(len(tracks)), lengths)
-    steps, bends = (np.flatnonzero(owner[n:] == owner[:-n]) for n in (1, 2))
+    steps, bends = (np.flatnonzero(tracks.numbers[n:] == tracks.numbers[:-n]) for n in (1, 2))
     count = len(guess)
     terms = (
         _differences(count, tuple(pairs), (1, -1), NEIGHBOUR_WEIGHT * similarity),
@@ -135,13 +142,15 @@ def shared_depths(
         _differences(count, (bends, bends + 1, bends + 2), (1, -2, 1), CURVATURE_WEIGHT),
     )
     smoothness = sum(term.T @ term for term in terms)
+    shaking, rays = windows(tracks.numbers, sights.times), sights.rays / per_depth[:, None]
     found = guess
     for _ in range(ITERATIONS):  # least absolute errors by reweighted least squares
         weights = trust / np.maximum(np.abs(found - guess), SMALL_ERROR)
         weights = np.where(one_sided & (found < guess), FLOATING_WEIGHT, 1) * weights
-        normal = (sparse.diags_array(weights) + smoothness).tocsr()
-        found, _ = cg(normal, weights * guess, x0=found, rtol=1e-4, maxiter=500)
-    return np.split(np.exp(found) / per_depth, np.cumsum(lengths)[:-1])
+        parallax, target = parallax_terms(shaking, found, sights.centres, rays, focal_length)
+        normal = (sparse.diags_array(weights) + smoothness + parallax.T @ parallax).tocsr()
+        found, _ = cg(normal, weights * guess + parallax.T @ target, x0=found, rtol=1e-4, maxiter=500)
+    return np.exp(found) / per_depth
 
 
 def _nearest_hidden(
@@ -176,11 +185,9 @@ def _neighbours(tracks: Tracks) -> Int[np.ndarray, "2 E"]:
     return np.concatenate([group[close(tracks.pixels[group])] for group in _by_frame(tracks)]).T
 
 
-def _similarity(
-    pairs: Int[np.ndarray, "2 E"], tracks: Sequence[Tracks], reach: int, sigma: float
-) -> Float[np.ndarray, " E"]:
+def _similarity(pairs: Int[np.ndarray, "2 E"], tracks: Tracks, reach: int, sigma: float) -> Float[np.ndarray, " E"]:
     """How similarly pairs of observations move, in (0, 1], on average over `reach` more frames before and after."""
-    velocities = np.concatenate([_velocities(track.pixels, reach) for track in tracks])
+    velocities = np.concatenate([_velocities(pixels, reach) for pixels in by_track(tracks, tracks.pixels)])
     first, second = velocities[pairs]
     return np.exp(-np.square(first - second).sum(-1) / (2 * sigma**2))
 

@@ -4,7 +4,6 @@ Points from structure from motion lie on static surfaces. A motion field that st
 out which of them to move where; tracks of optical flow tell before training begins.
 """
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -16,10 +15,10 @@ from l2dgs_jax.cameras.ground import Ground, find_ground, ground_depths, horizon
 from l2dgs_jax.data.dataset import Split
 from l2dgs_jax.model.deformation import path_weights
 from l2dgs_jax.model.initialisation import Seeds, path_knots, z_order
-from l2dgs_jax.training.depths import depths_around, depths_at, shared_depths
+from l2dgs_jax.training.depths import Sights, depths_around, depths_at, shared_depths
 from l2dgs_jax.training.flows import neighbour_flows
 from l2dgs_jax.training.given_depth import in_world_units
-from l2dgs_jax.training.tracks import SPACING, Tracks, find_tracks
+from l2dgs_jax.training.tracks import SPACING, Tracks, by_track, find_tracks
 
 MIN_LENGTH = 3  # frames that a track must be seen in
 MIN_MOVING_SHARE = 0.4  # share of these frames in which it must be seen to move
@@ -46,15 +45,15 @@ def find_seeds(points: Float[np.ndarray, "P 3"], split: Split, most: int) -> See
     knots = path_knots(len(cameras.time))
     weights = np.asarray(path_weights(jnp.asarray(cameras.time), knots))
     chosen = _moving_tracks(tracks, cameras, static, most)
-    if not chosen:
+    if not len(chosen.numbers):
         shapes = ((0, 3), (0, 3), (0,), (0, knots, 3), (0, 2))
         return Seeds(*(np.zeros(shape, np.float32) for shape in shapes))
     hidden = np.stack([depths.hidden for depths in around])
     given = _given_depths(chosen, cameras, points, split)
-    ground = find_ground(points, cameras.viewmat)
-    focal_length = float(cameras.K[:, 0, 0].mean())
-    depths = shared_depths(chosen, hidden, *_of_ground(chosen, cameras, ground), given, focal_length)
-    seeds = [_seed(split, cameras, weights, *track) for track in zip(chosen, depths, strict=True)]
+    sights = _sights(chosen, cameras, find_ground(points, cameras.viewmat), depths_at(chosen, hidden), given)
+    depths = shared_depths(chosen, sights, focal_length=float(cameras.K[:, 0, 0].mean()))
+    parts = zip(*(by_track(chosen, x) for x in (*chosen, depths)), strict=True)
+    seeds = [_seed(split, cameras, weights, Tracks(*track), depth) for *track, depth in parts]
     found = Seeds(*(np.array(rows, np.float32) for rows in zip(*seeds, strict=True)))
     order = z_order(found.points)
     return Seeds(*(rows[order] for rows in found))
@@ -68,10 +67,8 @@ class _Cameras(NamedTuple):
     time: Float[np.ndarray, " F"]
 
 
-def _moving_tracks(
-    tracks: Tracks, cameras: _Cameras, depths: Float32[np.ndarray, "C F h w"], most: int
-) -> list[Tracks]:
-    """The tracks that are long enough and surely move, one by one.
+def _moving_tracks(tracks: Tracks, cameras: _Cameras, depths: Float32[np.ndarray, "C F h w"], most: int) -> Tracks:
+    """The tracks that are long enough and surely move, the longest ones first.
 
     They are seen to move in enough of their frames, and leave the place where their first point, taken as static, would
     appear at any candidate depth.
@@ -79,7 +76,7 @@ def _moving_tracks(
     starts = np.flatnonzero(np.diff(tracks.numbers, prepend=-1))
     lengths = np.diff(starts, append=len(tracks.numbers))
     if not len(starts):
-        return []
+        return tracks
     deviations, viewmats, Ks = [], cameras.viewmat[tracks.frames], cameras.K[tracks.frames]
     for depth in depths:
         world = np.repeat(_unprojected(tracks, cameras, depths_at(tracks, depth))[starts], lengths, axis=0)
@@ -89,7 +86,8 @@ def _moving_tracks(
     deviates = np.min(deviations, axis=0) > MIN_DEVIATION  # not where a depth is NaN
     kept = np.flatnonzero((lengths >= MIN_LENGTH) & (moving_share > MIN_MOVING_SHARE) & deviates)
     chosen = kept[np.argsort(-lengths[kept], kind="stable")[:most]]
-    return [Tracks(*(x[starts[i] : starts[i] + lengths[i]] for x in tracks)) for i in chosen]
+    observed = np.concatenate([starts[i] + np.arange(lengths[i]) for i in chosen]) if len(chosen) else chosen
+    return Tracks(*(x[observed] for x in tracks))
 
 
 def _seed(
@@ -124,36 +122,39 @@ def _fitted_path(weights: Float[np.ndarray, "O K"], places: Float[np.ndarray, "O
     return np.linalg.solve(normal, weights.T @ places)
 
 
-def _of_ground(
-    tracks: Sequence[Tracks], cameras: _Cameras, ground: Ground | None
-) -> tuple[list[Float[np.ndarray, " _"]], list[Float[np.ndarray, " _"]]]:
-    """Horizontal distance per unit of depth, and depth of the ground, for the observations of each track.
+def _sights(
+    tracks: Tracks,
+    cameras: _Cameras,
+    ground: Ground | None,
+    hidden: Float32[np.ndarray, " O"],
+    given: Float[np.ndarray, " O"],
+) -> Sights:
+    """What cameras, ground and depths tell about the observations.
 
-    The former is 1 for all if it is unknown where up is, or cameras look too steeply; the latter is NaN for all if
-    there is no ground.
+    Where cameras look too steeply, horizontal distances are treated as unknown.
     """
-    ones = [np.ones(len(track.frames)) for track in tracks]
-    if ground is None:
-        return ones, [np.nan * one for one in ones]
-    places = [(track.pixels, cameras.viewmat[track.frames], cameras.K[track.frames]) for track in tracks]
-    horizontal = [horizontal_per_depth(*place, ground.up) for place in places]
-    steep = min(factor.min() for factor in horizontal) <= MIN_HORIZONTAL
-    return ones if steep else horizontal, [ground_depths(*place, ground) for place in places]
+    viewmat, K = cameras.viewmat[tracks.frames], cameras.K[tracks.frames]
+    horizontal, level = np.ones(len(hidden)), np.full(len(hidden), np.nan)
+    if ground is not None:
+        level = ground_depths(tracks.pixels, viewmat, K, ground)
+        per_depth = horizontal_per_depth(tracks.pixels, viewmat, K, ground.up)
+        horizontal = per_depth if per_depth.min() > MIN_HORIZONTAL else horizontal
+    times, rays = cameras.time[tracks.frames], pixel_rays(tracks.pixels, viewmat, K)
+    return Sights(times, camera_centres(viewmat), rays, horizontal, hidden, level, given)
 
 
 def _given_depths(
-    tracks: Sequence[Tracks], cameras: _Cameras, points: Float[np.ndarray, "P 3"], split: Split
-) -> list[Float[np.ndarray, " _"]]:
-    """The scene's own depth at the tracks, world units; NaN where it has none."""
-    frames = np.concatenate([track.frames for track in tracks])
-    columns, rows = np.concatenate([track.pixels for track in tracks]).astype(int).T
-    depths = np.full(len(frames), np.nan)
+    tracks: Tracks, cameras: _Cameras, points: Float[np.ndarray, "P 3"], split: Split
+) -> Float[np.ndarray, " O"]:
+    """The scene's own depth at the observations, world units; NaN where it has none."""
+    columns, rows = tracks.pixels.astype(int).T
+    depths = np.full(len(tracks.frames), np.nan)
     if split.depths is not None:
-        for frame in np.unique(frames):
-            here = frames == frame
+        for frame in np.unique(tracks.frames):
+            here = tracks.frames == frame
             depth = in_world_units(split.depths[frame], points, cameras.viewmat[frame], cameras.K[frame])
             depths[here] = depth[rows[here], columns[here]]
-    return np.split(depths, np.cumsum([len(track.frames) for track in tracks])[:-1])
+    return depths
 
 
 def _unprojected(tracks: Tracks, cameras: _Cameras, depth: Float[np.ndarray, " O"]) -> Float[np.ndarray, "O 3"]:

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int, UInt8
+from jaxtyping import Bool, Float, Float32, Int, Shaped, UInt8
 
 from l2dgs_jax.cameras.epipolar import epipolar_geometry, project
 from l2dgs_jax.cameras.flow import brightened, pixel_indices
@@ -34,6 +34,11 @@ class Tracks(NamedTuple):
     frames: Int[np.ndarray, " O"]
     pixels: Float[np.ndarray, "O 2"]
     moves: Bool[np.ndarray, " O"]
+
+
+def by_track(tracks: Tracks, values: Shaped[np.ndarray, "O ..."]) -> list[Shaped[np.ndarray, "_ ..."]]:
+    """Values of all observations, track by track."""
+    return np.split(values, np.flatnonzero(np.diff(tracks.numbers)) + 1)
 
 
 class _Heads(NamedTuple):

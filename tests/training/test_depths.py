@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from l2dgs_jax.training.depths import depths_around, shared_depths
-from l2dgs_jax.training.tracks import DEPTH_CELL, Tracks
+from l2dgs_jax.cameras.geometry import pixel_rays
+from l2dgs_jax.training.depths import Sights, depths_around, depths_at, shared_depths
+from l2dgs_jax.training.tracks import DEPTH_CELL, Tracks, by_track
 
 HEIGHT, WIDTH, FRAMES = 24, 32, 8
 K = np.array([[30.0, 0, WIDTH / 2], [0, 30.0, HEIGHT / 2], [0, 0, 1]])
@@ -22,9 +23,17 @@ def cells(value=2.0):
 
 
 def solved(tracks, hidden, factors=1.0, ground=np.nan, given=np.nan, focal_length=200.0):
-    """Depths of tracks; the rest is the same for all, or has a row for each track or a column for each frame."""
-    rest = (list(np.broadcast_to(value, (len(tracks), FRAMES))) for value in (factors, ground, given))
-    return shared_depths(tracks, hidden, *rest, focal_length)
+    """Depths of tracks seen by a resting camera.
+
+    Depths and factors are the same for all, or have a row for each track or a column for each frame.
+    """
+    merged = Tracks(*(np.concatenate(parts) for parts in zip(*tracks, strict=True)))
+    factors, ground, given = (np.broadcast_to(x, (len(tracks), FRAMES)).ravel() for x in (factors, ground, given))
+    count = len(merged.frames)
+    rays = pixel_rays(merged.pixels, np.broadcast_to(np.eye(4), (count, 4, 4)), np.broadcast_to(K, (count, 3, 3)))
+    times, centres = merged.frames / FRAMES, np.zeros((count, 3))
+    sights = Sights(times, centres, rays, factors, depths_at(merged, hidden), ground, given)
+    return by_track(merged, shared_depths(merged, sights, focal_length))
 
 
 def test_depths_around_are_ordered_and_lie_within_those_of_the_points():
@@ -161,3 +170,17 @@ def test_depth_that_is_given_outweighs_the_guess():
 def test_given_depth_is_no_horizontal_distance(factor):
     (depth,) = solved([track(0, (4.5, 4.5), (1, 0.5))], cells(), factor, given=1.5)
     assert_allclose(depth, 1.5, rtol=1e-3)
+
+
+@pytest.mark.parametrize(("amount", "low", "high"), [(0.0, 3.9, 4.1), (0.05, 1.9, 2.1)])
+def test_what_moves_smoothly_is_where_the_shaking_of_the_camera_tells(amount, low, high):
+    frames, shape = 24, np.array([HEIGHT, WIDTH])
+    centres = np.random.default_rng(0).normal(size=(frames, 3)) * (amount, amount, 0)
+    place = np.array([0.0, 0.0, 2.0]) + np.linspace(-0.3, 0.3, frames)[:, None] * (1.0, 0.5, 0)
+    rays = (place - centres) / 2
+    pixels = 30.0 * rays[:, :2] + shape[::-1] / 2
+    seen = Tracks(np.zeros(frames, int), np.arange(frames), pixels, np.ones(frames, bool))
+    unknown, hidden = np.full(frames, np.nan), np.full(frames, 4.0)
+    sights = Sights(seen.frames / frames, centres, rays, np.ones(frames), hidden, unknown, unknown)
+    found = shared_depths(seen, sights, 200.0)
+    assert low < found.min() <= found.max() < high
