@@ -38,8 +38,10 @@ def run(
             warnings.showwarning = _show_warning  # type: ignore[assignment]
             try:
                 command(sys.argv[1:] if arguments is None else arguments)
-            finally:
+            except SystemExit:  # after --help
                 sys.stdout.flush()
+                raise
+            sys.stdout.flush()
     except BrokenPipeError:  # whatever reads the output, such as `head`, has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes once more when it ends
         sys.exit(128 + signal.SIGPIPE)

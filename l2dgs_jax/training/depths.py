@@ -1,4 +1,4 @@
-"""Depths of tracks: as given, or of the nearest surface that an object hides; similar for tracks that move alike."""
+"""Depths of tracks: as given, or of the nearest surface that an object hides, corrected by parallax."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -11,7 +11,8 @@ from scipy.sparse.linalg import cg
 from scipy.spatial import cKDTree
 
 from l2dgs_jax.cameras.geometry import project_points
-from l2dgs_jax.training.parallax import parallax_terms, windows
+from l2dgs_jax.training import parallax
+from l2dgs_jax.training.parallax import find_windows
 from l2dgs_jax.training.tracks import DEPTH_CELL, Tracks, by_track
 
 NEIGHBOURS = 30  # nearest points of a pixel that depths are taken from
@@ -35,6 +36,7 @@ FLOATING_WEIGHT = 0.3  # being nearer than a guess that is not that of the groun
 TYPICAL_ERROR = 0.1  # of the guess, in log-distance
 SMALL_ERROR = 0.02  # below which errors of the guess count as squares
 ITERATIONS = 15
+STEP_TOLERANCE = 1e-3  # of the residual, in each of them
 
 
 class Depths(NamedTuple):
@@ -50,13 +52,13 @@ class Depths(NamedTuple):
 
 
 class Sights(NamedTuple):
-    """What cameras and scene tell about each of O observations; depths are NaN where they are unknown.
+    """What cameras and scene tell about the O observations of tracks, in their order; depths are NaN where unknown.
 
     Attributes:
         times: at which they are made.
         centres: of the cameras, world units.
         rays: from there through the pixels, per unit of depth.
-        horizontal: distance per unit of depth, positive; 1 for all if it is unknown where up is.
+        horizontal: horizontal distance per unit of depth, positive; 1 for all if it is unknown where up is.
         hidden: depth of the surface that something there would hide, world units.
         ground: depth at which the ground would be seen there, world units.
         given: depth that came with the scene, world units.
@@ -112,7 +114,7 @@ def shared_depths(tracks: Tracks, sights: Sights, focal_length: float) -> Float[
     far as parallax tells, and changes smoothly along a track and between neighbours that move alike.
 
     Args:
-        tracks: at least one observation, and at least one in a cell of known depth.
+        tracks: at least one observation lies in a cell of known depth.
         sights: what cameras and scene tell about them.
         focal_length: of the cameras, pixels: how far apart and how fast things are is judged by angles.
     """
@@ -142,14 +144,22 @@ def shared_depths(tracks: Tracks, sights: Sights, focal_length: float) -> Float[
         _differences(count, (bends, bends + 1, bends + 2), (1, -2, 1), CURVATURE_WEIGHT),
     )
     smoothness = sum(term.T @ term for term in terms)
-    shaking, rays = windows(tracks.numbers, sights.times), sights.rays / per_depth[:, None]
+    windows = find_windows(tracks.numbers, sights.times)
+    rays = sights.rays / per_depth[:, None]  # per unit of horizontal distance
+    size = windows.places.size
+    mean = sparse.csr_array(
+        (np.full(size, 0.25), windows.places.ravel(), np.arange(0, size + 1, 4)), (len(windows.places), count)
+    )
     found = guess
     for _ in range(ITERATIONS):  # least absolute errors by reweighted least squares
         weights = trust / np.maximum(np.abs(found - guess), SMALL_ERROR)
         weights = np.where(one_sided & (found < guess), FLOATING_WEIGHT, 1) * weights
-        parallax, target = parallax_terms(shaking, found, sights.centres, rays, focal_length)
-        normal = (sparse.diags_array(weights) + smoothness + parallax.T @ parallax).tocsr()
-        found, _ = cg(normal, weights * guess + parallax.T @ target, x0=found, rtol=1e-4, maxiter=500)
+        shaking, certainty = parallax.estimates(windows, found, sights.centres, rays, focal_length)
+        normal = (sparse.diags_array(weights) + smoothness + mean.T @ sparse.diags_array(certainty) @ mean).tocsr()
+        residual = weights * (guess - found) - smoothness @ found + mean.T @ (certainty * (shaking - mean @ found))
+        # Solving for the step makes its accuracy independent of the scene's unit.
+        step, _ = cg(normal, residual, rtol=STEP_TOLERANCE, maxiter=500, M=sparse.diags_array(1 / normal.diagonal()))
+        found = found + step
     return np.exp(found) / per_depth
 
 

@@ -37,7 +37,7 @@ class Tracks(NamedTuple):
 
 
 def by_track(tracks: Tracks, values: Shaped[np.ndarray, "O ..."]) -> list[Shaped[np.ndarray, "_ ..."]]:
-    """Values of all observations, track by track."""
+    """Values of all observations, track by track; there is at least one."""
     return np.split(values, np.flatnonzero(np.diff(tracks.numbers)) + 1)
 
 
@@ -91,6 +91,7 @@ def find_tracks(split: Split, flows: Flows, depths: Float32[np.ndarray, "C F h w
 
 
 def _joined(heads: Sequence[_Heads]) -> _Heads:
+    """All of them, in that order."""
     return _Heads(*(np.concatenate(parts) for parts in zip(*heads, strict=True)))
 
 
@@ -101,19 +102,19 @@ def _cells(pixels: Float[np.ndarray, "N 2"], width: int) -> Int[np.ndarray, " N"
 
 
 def _foremost(heads: _Heads, width: int) -> _Heads:
-    """The one in each cell that deviates most."""
+    """The track in each cell that deviates most."""
     order = np.argsort(-heads.deviations, kind="stable")
     first = order[np.unique(_cells(heads.pixels[order], width), return_index=True)[1]]
     return _Heads(*(x[first] for x in heads))
 
 
 def _seen(heads: _Heads, frame: int, moves: Bool[np.ndarray, "H W"]) -> Tracks:
-    """Observations of the tracks in a frame whose pixels move or not."""
+    """Observations of these tracks in a frame; `moves` tells which of its pixels move."""
     return Tracks(heads.numbers, np.full(len(heads.numbers), frame), heads.pixels, _at(moves, heads.pixels))
 
 
 def _carried(heads: _Heads, flow: Float32[np.ndarray, "H W 2"], deviations: Float32[np.ndarray, "H W"]) -> _Heads:
-    """Those that the flow carries to a place in the following frame; it is NaN where it is not to be trusted."""
+    """The tracks that flow carries to a place in the following frame; it is NaN where it is not to be trusted."""
     ends = heads.pixels + _at(flow, heads.pixels)
     height, width = deviations.shape
     inside = ((ends >= 0) & (ends < (width, height))).all(-1)  # not where flow is NaN

@@ -60,10 +60,22 @@ def test_a_warning_is_printed_as_one_sentence(capsys):
     assert capsys.readouterr().err == "warning: it is slow\n"
 
 
-def test_a_reader_that_has_seen_enough_ends_the_program_without_a_word():
-    for command in ("evaluate", "train"):
-        arguments = [sys.executable, "-m", f"l2dgs_jax.{command}", "--help"]
-        with subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as program:
-            program.stdout.close()  # before anything is written
-            assert program.stderr.read() == b""
-        assert program.returncode == 128 + signal.SIGPIPE
+PRINTS = "print('x' * 100_000)"
+MISTAKE = "from l2dgs_jax.errors import UserError; raise UserError('no such file')"
+
+
+@pytest.mark.parametrize(
+    ("program", "code", "said"),
+    [
+        ("from l2dgs_jax import evaluate; evaluate.main(['--help'])", 128 + signal.SIGPIPE, b""),
+        (PRINTS, 128 + signal.SIGPIPE, b""),
+        (MISTAKE, 2, b"error: no such file\n"),
+    ],
+    ids=["help", "output", "mistake"],
+)
+def test_a_reader_that_has_seen_enough_is_no_error_and_hides_none(program, code, said):
+    script = f"from l2dgs_jax.runtime import command_line\ncommand_line.run(lambda _: exec({program!r}), [])"
+    with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as running:
+        running.stdout.close()  # before anything is written
+        assert running.stderr.read() == said
+    assert running.returncode == code

@@ -172,15 +172,27 @@ def test_given_depth_is_no_horizontal_distance(factor):
     assert_allclose(depth, 1.5, rtol=1e-3)
 
 
-@pytest.mark.parametrize(("amount", "low", "high"), [(0.0, 3.9, 4.1), (0.05, 1.9, 2.1)])
-def test_what_moves_smoothly_is_where_the_shaking_of_the_camera_tells(amount, low, high):
-    frames, shape = 24, np.array([HEIGHT, WIDTH])
+def shaken(amount, guess, factor=1.0, unit=1.0):
+    """Found over true depths of a track at depth 2, seen by a shaking camera."""
+    frames = 24
     centres = np.random.default_rng(0).normal(size=(frames, 3)) * (amount, amount, 0)
-    place = np.array([0.0, 0.0, 2.0]) + np.linspace(-0.3, 0.3, frames)[:, None] * (1.0, 0.5, 0)
-    rays = (place - centres) / 2
-    pixels = 30.0 * rays[:, :2] + shape[::-1] / 2
-    seen = Tracks(np.zeros(frames, int), np.arange(frames), pixels, np.ones(frames, bool))
-    unknown, hidden = np.full(frames, np.nan), np.full(frames, 4.0)
-    sights = Sights(seen.frames / frames, centres, rays, np.ones(frames), hidden, unknown, unknown)
-    found = shared_depths(seen, sights, 200.0)
-    assert low < found.min() <= found.max() < high
+    path = np.array([0.0, 0.0, 2.0]) + np.linspace(-0.3, 0.3, frames)[:, None] * (1.0, 0.5, 0)
+    rays = (path - centres) / 2
+    track = Tracks(np.zeros(frames, int), np.arange(frames), 30.0 * rays[:, :2] + 50, np.ones(frames, bool))
+    unknown, hidden = np.full(frames, np.nan), np.full(frames, guess * unit)
+    factors = np.full(frames, factor)
+    sights = Sights(track.frames / frames, centres * unit, rays, factors, hidden, unknown, unknown)
+    return shared_depths(track, sights, 200.0) / (2.0 * unit)
+
+
+@pytest.mark.parametrize("guess", [1.0, 4.0])
+@pytest.mark.parametrize("factor", [1.0, 0.7])
+@pytest.mark.parametrize("amount", [0.02, 0.1, 0.4])
+def test_what_moves_smoothly_is_where_the_shaking_of_the_camera_tells(amount, factor, guess):
+    assert_allclose(shaken(amount, guess, factor), 1, rtol=0.05)
+    assert_allclose(shaken(0.0, guess, factor), guess / 2, rtol=0.05)  # a camera at rest tells nothing
+
+
+@pytest.mark.parametrize("unit", [0.01, 1000.0])
+def test_depths_do_not_depend_on_the_unit_of_length(unit):
+    assert_allclose(shaken(0.01, 3.0, unit=unit), shaken(0.01, 3.0), rtol=1e-3)
