@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Float32, Int
+from jaxtyping import Bool, Float, Float32, Int
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import cg
@@ -120,47 +120,81 @@ def shared_depths(tracks: Tracks, sights: Sights, focal_length: float) -> Float[
     """
     pairs, sigma = _neighbours(tracks), max(FLOW_SIGMA, VELOCITY_SIGMA * focal_length)
     similarity, on_average = (_similarity(pairs, tracks, reach, sigma) for reach in (0, STRIDE))
-    per_depth, behind, level = sights.horizontal, sights.hidden, sights.ground
-    floats = behind < ON_GROUND * level
-    behind = per_depth * np.where(~floats & (behind < level / ON_GROUND), level, behind)
+    alike, alike_on_average = (pairs[:, similar > ALIKE] for similar in (similarity, on_average))
     width = max(MIN_COLUMNS, COLUMNS * focal_length)
-    nearest, of_body = (
-        _nearest_hidden(tracks, behind, pairs[:, similar > ALIKE], width) for similar in (similarity, on_average)
-    )
-    nearest = np.where(floats[nearest] & (behind[of_body] < behind[nearest]), of_body, nearest)
-    told = per_depth * sights.given
-    is_told = np.isfinite(told)
-    guess = np.log(np.where(is_told, told, behind[nearest]))
-    known = np.isfinite(guess)
-    trust = TYPICAL_ERROR * known * np.where(is_told, GIVEN_WEIGHT, 1)
-    one_sided = floats[nearest] & ~is_told
-    guess = np.where(known, guess, guess[known].mean())
-
-    steps, bends = (np.flatnonzero(tracks.numbers[n:] == tracks.numbers[:-n]) for n in (1, 2))
-    count = len(guess)
-    terms = (
-        _differences(count, tuple(pairs), (1, -1), NEIGHBOUR_WEIGHT * similarity),
-        _differences(count, (steps, steps + 1), (1, -1), CHANGE_WEIGHT),
-        _differences(count, (bends, bends + 1, bends + 2), (1, -2, 1), CURVATURE_WEIGHT),
-    )
-    smoothness = sum(term.T @ term for term in terms)
-    windows = find_windows(tracks.numbers, sights.times)
-    rays = sights.rays / per_depth[:, None]  # per unit of horizontal distance
-    size = windows.places.size
-    mean = sparse.csr_array(
-        (np.full(size, 0.25), windows.places.ravel(), np.arange(0, size + 1, 4)), (len(windows.places), count)
-    )
+    guess, trust, floats = _first_guess(tracks, sights, alike, alike_on_average, width)
+    smoothness = _smoothness(tracks, pairs, similarity)
+    windows, rays = find_windows(tracks.numbers, sights.times), sights.rays / sights.horizontal[:, None]
+    mean = _means(windows.places, len(guess))
     found = guess
     for _ in range(ITERATIONS):  # least absolute errors by reweighted least squares
         weights = trust / np.maximum(np.abs(found - guess), SMALL_ERROR)
-        weights = np.where(one_sided & (found < guess), FLOATING_WEIGHT, 1) * weights
+        weights = np.where(floats & (found < guess), FLOATING_WEIGHT, 1) * weights
         shaking, certainty = parallax.estimates(windows, found, sights.centres, rays, focal_length)
         normal = (sparse.diags_array(weights) + smoothness + mean.T @ sparse.diags_array(certainty) @ mean).tocsr()
         residual = weights * (guess - found) - smoothness @ found + mean.T @ (certainty * (shaking - mean @ found))
         # Solving for the step makes its accuracy independent of the scene's unit.
         step, _ = cg(normal, residual, rtol=STEP_TOLERANCE, maxiter=500, M=sparse.diags_array(1 / normal.diagonal()))
         found = found + step
-    return np.exp(found) / per_depth
+    return np.exp(found) / sights.horizontal
+
+
+class _Guess(NamedTuple):
+    """The first guess of horizontal distances.
+
+    Attributes:
+        logs: of the distances.
+        trust: weights of their absolute errors; 0 where nothing is known, and the guess is the mean of all others.
+        floats: whether nothing that the object hides is the ground.
+    """
+
+    logs: Float[np.ndarray, " O"]
+    trust: Float[np.ndarray, " O"]
+    floats: Bool[np.ndarray, " O"]
+
+
+def _first_guess(
+    tracks: Tracks, sights: Sights, alike: Int[np.ndarray, "2 E"], on_average: Int[np.ndarray, "2 A"], width: float
+) -> _Guess:
+    """Given distances, or the nearest that objects hide up to `width` pixels to either side.
+
+    Args:
+        tracks: their observations.
+        sights: what is known about them.
+        alike: pairs of observations that move alike.
+        on_average: pairs that do so on average over a longer time.
+        width: of the columns in which objects hide what counts, to either side.
+    """
+    floats = sights.hidden < ON_GROUND * sights.ground
+    on_ground = ~floats & (sights.hidden < sights.ground / ON_GROUND)
+    behind = sights.horizontal * np.where(on_ground, sights.ground, sights.hidden)
+    nearest, of_body = (_nearest_hidden(tracks, behind, pairs, width) for pairs in (alike, on_average))
+    nearest = np.where(floats[nearest] & (behind[of_body] < behind[nearest]), of_body, nearest)
+    told = sights.horizontal * sights.given
+    is_told = np.isfinite(told)
+    logs = np.log(np.where(is_told, told, behind[nearest]))
+    known = np.isfinite(logs)
+    trust = TYPICAL_ERROR * known * np.where(is_told, GIVEN_WEIGHT, 1)
+    return _Guess(np.where(known, logs, logs[known].mean()), trust, floats[nearest] & ~is_told)
+
+
+def _smoothness(tracks: Tracks, pairs: Int[np.ndarray, "2 E"], similarity: Float[np.ndarray, " E"]) -> sparse.csr_array:
+    """The quadratic form of how much log-distances change along tracks and between pairs of observations."""
+    steps, bends = (np.flatnonzero(tracks.numbers[n:] == tracks.numbers[:-n]) for n in (1, 2))
+    count = len(tracks.numbers)
+    terms = (
+        _differences(count, tuple(pairs), (1, -1), NEIGHBOUR_WEIGHT * similarity),
+        _differences(count, (steps, steps + 1), (1, -1), CHANGE_WEIGHT),
+        _differences(count, (bends, bends + 1, bends + 2), (1, -2, 1), CURVATURE_WEIGHT),
+    )
+    return sum(term.T @ term for term in terms).tocsr()
+
+
+def _means(places: Int[np.ndarray, "W K"], count: int) -> sparse.csr_array:
+    """The matrix that takes means over K of `count` values each."""
+    number, size = places.shape
+    starts = np.arange(0, places.size + 1, size)
+    return sparse.csr_array((np.full(places.size, 1 / size), places.ravel(), starts), (number, count))
 
 
 def _nearest_hidden(
