@@ -12,7 +12,6 @@ from scipy.spatial import cKDTree
 
 from l2dgs_jax.cameras.geometry import project_points
 from l2dgs_jax.training import parallax
-from l2dgs_jax.training.parallax import find_windows
 from l2dgs_jax.training.tracks import DEPTH_CELL, Tracks, by_track
 
 NEIGHBOURS = 30  # nearest points of a pixel that depths are taken from
@@ -124,13 +123,14 @@ def shared_depths(tracks: Tracks, sights: Sights, focal_length: float) -> Float[
     width = max(MIN_COLUMNS, COLUMNS * focal_length)
     guess, trust, floats = _first_guess(tracks, sights, alike, alike_on_average, width)
     smoothness = _smoothness(tracks, pairs, similarity)
-    windows, rays = find_windows(tracks.numbers, sights.times), sights.rays / sights.horizontal[:, None]
-    mean = _means(windows.places, len(guess))
+    rays = sights.rays / sights.horizontal[:, None]
+    windows = parallax.find_windows(tracks.numbers, sights.times, sights.centres, rays)
+    mean = _combinations(len(guess), tuple(windows.places.T), (0.25,) * 4, 1.0)
     found = guess
     for _ in range(ITERATIONS):  # least absolute errors by reweighted least squares
         weights = trust / np.maximum(np.abs(found - guess), SMALL_ERROR)
         weights = np.where(floats & (found < guess), FLOATING_WEIGHT, 1) * weights
-        shaking, certainty = parallax.estimates(windows, found, sights.centres, rays, focal_length)
+        shaking, certainty = parallax.estimates(windows, found, focal_length)
         normal = (sparse.diags_array(weights) + smoothness + mean.T @ sparse.diags_array(certainty) @ mean).tocsr()
         residual = weights * (guess - found) - smoothness @ found + mean.T @ (certainty * (shaking - mean @ found))
         # Solving for the step makes its accuracy independent of the scene's unit.
@@ -183,18 +183,11 @@ def _smoothness(tracks: Tracks, pairs: Int[np.ndarray, "2 E"], similarity: Float
     steps, bends = (np.flatnonzero(tracks.numbers[n:] == tracks.numbers[:-n]) for n in (1, 2))
     count = len(tracks.numbers)
     terms = (
-        _differences(count, tuple(pairs), (1, -1), NEIGHBOUR_WEIGHT * similarity),
-        _differences(count, (steps, steps + 1), (1, -1), CHANGE_WEIGHT),
-        _differences(count, (bends, bends + 1, bends + 2), (1, -2, 1), CURVATURE_WEIGHT),
+        _combinations(count, tuple(pairs), (1, -1), NEIGHBOUR_WEIGHT * similarity),
+        _combinations(count, (steps, steps + 1), (1, -1), CHANGE_WEIGHT),
+        _combinations(count, (bends, bends + 1, bends + 2), (1, -2, 1), CURVATURE_WEIGHT),
     )
     return sum(term.T @ term for term in terms).tocsr()
-
-
-def _means(places: Int[np.ndarray, "W K"], count: int) -> sparse.csr_array:
-    """The matrix that takes means over K of `count` values each."""
-    number, size = places.shape
-    starts = np.arange(0, places.size + 1, size)
-    return sparse.csr_array((np.full(places.size, 1 / size), places.ravel(), starts), (number, count))
 
 
 def _nearest_hidden(
@@ -243,10 +236,10 @@ def _velocities(pixels: Float[np.ndarray, "O 2"], reach: int) -> Float[np.ndarra
     return (pixels[end] - pixels[start]) / (end - start)[:, None]
 
 
-def _differences(
+def _combinations(
     count: int,
     places: Sequence[Int[np.ndarray, " E"]],
-    factors: Sequence[int],
+    factors: Sequence[int | float],
     weights: Float[np.ndarray, " E"] | float,
 ) -> sparse.csr_array:
     """E rows of a least-squares problem in `count` unknowns, of linear combinations of the unknowns at `places`."""

@@ -14,38 +14,55 @@ MAX_WEIGHT = 10.0  # of an estimate; one that counts more would outweigh the smo
 
 
 class Windows(NamedTuple):
-    """Four observations of a track each, W in all.
+    """Four observations of a track each, W in all, with what makes up their third differences across the line of sight.
 
     Attributes:
         places: of the observations among those of all tracks.
-        factors: weights of values at their times in the third divided difference, scaled to unit norm.
+        rays: from the cameras per unit of distance, times their weights in the difference, across the line of sight.
+        camera: the third difference of the cameras' centres across the line of sight, world units.
+        lengths: of one of the rays per unit of distance.
     """
 
     places: Int[np.ndarray, "W 4"]
-    factors: Float[np.ndarray, "W 4"]
+    rays: Float[np.ndarray, "W 4 3"]
+    camera: Float[np.ndarray, "W 3"]
+    lengths: Float[np.ndarray, " W"]
 
 
-def find_windows(numbers: Int[np.ndarray, " O"], times: Float[np.ndarray, " O"]) -> Windows:
+def find_windows(
+    numbers: Int[np.ndarray, " O"],
+    times: Float[np.ndarray, " O"],
+    centres: Float[np.ndarray, "O 3"],
+    rays: Float[np.ndarray, "O 3"],
+) -> Windows:
     """All windows of observations that are grouped by track and in order of time.
 
     Args:
         numbers: of the tracks that they belong to.
         times: at which they are made, different within a track.
+        centres: of the cameras, world units.
+        rays: from there to the observed points, per unit of distance.
     """
     starts = np.arange(len(numbers))[:, None]
     places = np.concatenate([starts[: -3 * spacing] + spacing * np.arange(4) for spacing in SPACINGS])
     places = places[numbers[places[:, 0]] == numbers[places[:, -1]]]
-    apart = times[places][:, :, None] - times[places][:, None]
+    factors = third_difference(times[places])[..., None]
+    lengths = np.linalg.norm(rays[places[:, 1]], axis=-1)
+    sight = rays[places[:, 1]] / lengths[:, None]
+    across = lambda x, sight: x - (x * sight).sum(-1, keepdims=True) * sight
+    camera = across((factors * centres[places]).sum(1), sight)
+    return Windows(places, across(factors * rays[places], sight[:, None]), camera, lengths)
+
+
+def third_difference(times: Float[np.ndarray, "W 4"]) -> Float[np.ndarray, "W 4"]:
+    """Weights of values at these times in their third divided difference, scaled to unit norm."""
+    apart = times[:, :, None] - times[:, None]
     factors = 1 / np.prod(apart + np.eye(4), axis=-1)
-    return Windows(places, factors / np.linalg.norm(factors, axis=-1, keepdims=True))
+    return factors / np.linalg.norm(factors, axis=-1, keepdims=True)
 
 
 def estimates(
-    windows: Windows,
-    distances: Float[np.ndarray, " O"],
-    centres: Float[np.ndarray, "O 3"],
-    rays: Float[np.ndarray, "O 3"],
-    focal_length: float,
+    windows: Windows, distances: Float[np.ndarray, " O"], focal_length: float
 ) -> tuple[Float[np.ndarray, " W"], Float[np.ndarray, " W"]]:
     """The mean log-distance in each window that explains best how it seems to shake, and its weight in least squares.
 
@@ -58,19 +75,13 @@ def estimates(
     Args:
         windows: of the observations.
         distances: present estimates, logarithms of world units: a point is at `centre + exp(distance) * ray`.
-        centres: of the cameras, world units.
-        rays: from there to the observed points, per unit of distance.
         focal_length: of the cameras, pixels.
     """
-    places, factors = windows
-    common = distances[places].mean(-1)
-    relative = np.exp(distances[places] - common[:, None])
-    camera = np.exp(-common)[:, None] * np.einsum("wk,wkc->wc", factors, centres[places])
-    path = camera + np.einsum("wk,wkc->wc", factors * relative, rays[places])
-    lengths = np.linalg.norm(rays[places[:, 1]], axis=-1)
-    sight = rays[places[:, 1]] / lengths[:, None]
-    camera, path = (x - (x * sight).sum(-1, keepdims=True) * sight for x in (camera, path))
-    per_sigma = 1 / (max(SIGMA, MIN_SIGMA / focal_length) * lengths)
+    common = distances[windows.places].mean(-1)
+    relative = np.exp(distances[windows.places] - common[:, None])
+    camera = np.exp(-common)[:, None] * windows.camera
+    path = camera + np.einsum("wk,wkc->wc", relative, windows.rays)
+    per_sigma = 1 / (max(SIGMA, MIN_SIGMA / focal_length) * windows.lengths)
     deviations = per_sigma * np.linalg.norm(path, axis=-1)
     visible = np.square(camera).sum(-1)
     step = (camera * path).sum(-1) / np.maximum(visible, np.finfo(float).tiny)

@@ -1,7 +1,7 @@
 """Tracks of what moves: pixels whose optical flow differs from what the motion of the camera explains."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import cv2
 import numpy as np
@@ -49,6 +49,9 @@ class _Heads(NamedTuple):
     deviations: Float[np.ndarray, " N"]
 
 
+T = TypeVar("T", Tracks, _Heads)
+
+
 def find_tracks(split: Split, flows: Flows, depths: Float32[np.ndarray, "C F h w"]) -> Tracks:
     """Follow what moves from frame to frame, as long as flow can be trusted.
 
@@ -85,14 +88,14 @@ def find_tracks(split: Split, flows: Flows, depths: Float32[np.ndarray, "C F h w
         count += len(fresh)
         observed.append(_seen(heads, frame, moves))
         arrived[following].append(_carried(heads, flow, deviations))
-    merged = Tracks(*(np.concatenate(parts) for parts in zip(*observed, strict=True)))
+    merged = _joined(observed)
     order = np.lexsort((times[merged.frames], merged.numbers))
     return Tracks(*(x[order] for x in merged))
 
 
-def _joined(heads: Sequence[_Heads]) -> _Heads:
-    """All of them, in that order."""
-    return _Heads(*(np.concatenate(parts) for parts in zip(*heads, strict=True)))
+def _joined(parts: Sequence[T]) -> T:
+    """All of them as one, in that order."""
+    return type(parts[0])(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
 
 def _cells(pixels: Float[np.ndarray, "N 2"], width: int) -> Int[np.ndarray, " N"]:
