@@ -1,4 +1,4 @@
-"""Depths of tracks: as given, or of the nearest surface that an object hides, corrected by parallax."""
+"""Depths of tracks: as given, or of the surface that an object stands on, corrected by parallax."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -19,10 +19,12 @@ STATIC_QUANTILES = 0.03, 0.97  # of their depths, between which static surfaces 
 CANDIDATES = 4  # depths in that range, evenly spaced in inverse depth
 BORDER = 0.1  # distance from the picture within which points still count, in focal lengths
 NEIGHBOUR_RADIUS = 9.0  # pixels within which tracks may belong to one object
-VELOCITY_SIGMA = 0.0015  # standard deviation of velocities within one object, in focal lengths per frame
-FLOW_SIGMA = 0.3  # that of optical flow, pixels per frame
+VELOCITY_SIGMA = 0.004  # standard deviation of velocities within one object, in focal lengths per frame
+MIN_VELOCITY_SIGMA = 0.75  # at least this, pixels per frame: flow has errors
 ALIKE = 0.5  # similarity of motion from which neighbours belong to one object
-STRIDE = 8  # frames before and after, over which a limb moves on average as the body that it swings about
+PAIRS = 20_000  # pairs of tracks that are compared at a time
+BELOW = 1.5, 9.0  # pixels below an observation between which nothing moves if it is the foot of an object
+BESIDE = 4.5  # and to either side
 COLUMNS = 0.03  # distance to either side in which what an object hides counts, in focal lengths
 MIN_COLUMNS = 6.0  # at least this distance, pixels
 ON_GROUND = 0.8  # a surface is taken for the ground from this share of the ground's depth there up to its inverse
@@ -31,7 +33,7 @@ NEIGHBOUR_WEIGHT = 1.0  # between neighbours, times the similarity of their moti
 CURVATURE_WEIGHT = 1000.0  # second differences along a track
 CHANGE_WEIGHT = 30.0  # first differences along a track
 GIVEN_WEIGHT = 10.0  # depth that came with the scene, compared with a guess
-FLOATING_WEIGHT = 0.3  # being nearer than a guess that is not that of the ground
+FLOATING_WEIGHT = 0.3  # being nearer than a guess that comes from no foot
 TYPICAL_ERROR = 0.1  # of the guess, in log-distance
 SMALL_ERROR = 0.02  # below which errors of the guess count as squares
 ITERATIONS = 15
@@ -59,8 +61,8 @@ class Sights(NamedTuple):
         rays: from there through the pixels, per unit of depth.
         horizontal: horizontal distance per unit of depth, positive; 1 for all if it is unknown where up is.
         hidden: depth of the surface that something there would hide, world units.
-        ground: depth at which the ground would be seen there, world units.
         given: depth that came with the scene, world units.
+        background: whether they look like that surface.
     """
 
     times: Float[np.ndarray, " O"]
@@ -68,8 +70,8 @@ class Sights(NamedTuple):
     rays: Float[np.ndarray, "O 3"]
     horizontal: Float[np.ndarray, " O"]
     hidden: Float[np.ndarray, " O"]
-    ground: Float[np.ndarray, " O"]
     given: Float[np.ndarray, " O"]
+    background: Bool[np.ndarray, " O"]
 
 
 def depths_around(
@@ -100,39 +102,43 @@ def depths_at(tracks: Tracks, depths: Float32[np.ndarray, "F h w"]) -> Float32[n
     return depths[tracks.frames, rows, columns]
 
 
-def shared_depths(tracks: Tracks, sights: Sights, focal_length: float) -> Float[np.ndarray, " O"]:
+def with_ground(hidden: Float[np.ndarray, " O"], ground: Float[np.ndarray, " O"]) -> Float[np.ndarray, " O"]:
+    """Depths of surfaces: where they are nearly that of the ground's plane, `ground`, this tells them better."""
+    return np.where((ON_GROUND * ground <= hidden) & (ON_GROUND * hidden < ground), ground, hidden)
+
+
+def shared_depths(tracks: Tracks, sights: Sights, focal_length: float, height: int) -> Float[np.ndarray, " O"]:
     """Depths of all observations of the tracks, solved for jointly, world units.
 
-    Solved for are horizontal distances, because they are the same for all parts of an upright object. Where no depth is
-    given, the first guess is the nearest that the object hides: most objects stand on something, which is what their
-    lowest part hides. If this is the ground, its plane tells the distance better than the points around. A trunk on
-    swinging legs seems to be an object by itself that hides what is far behind it. Hence, where the nearest that an
-    object hides is not the ground, whatever moves alike on average over a longer time belongs to it too; if that does
-    not reach the ground either, the object may be nearer than the guess at little cost. The guess is also wrong where
-    only the upper part is in view, or what seems to be one object is several; so the solution may depart from it, as
-    far as parallax tells, and changes smoothly along a track and between neighbours that move alike.
+    Solved for are horizontal distances, because they are the same for all parts of an upright object. Most objects
+    stand on something, which is what their feet hide: parts with nothing that moves just below. Where no depth is
+    given, the first guess is the nearest foot of the object, or, if it shows none, the nearest of all that it hides:
+    then it may be nearer at little cost. The guess is also wrong where what seems to be one object is several; so the
+    solution may depart from it, as far as parallax tells, and changes smoothly along a track and between neighbours
+    that move alike.
 
     Args:
         tracks: at least one observation lies in a cell of known depth.
         sights: what cameras and scene tell about them.
         focal_length: of the cameras, pixels: how far apart and how fast things are is judged by angles.
+        height: of the frames, pixels.
     """
-    pairs, sigma = _neighbours(tracks), max(FLOW_SIGMA, VELOCITY_SIGMA * focal_length)
-    similarity, on_average = (_similarity(pairs, tracks, reach, sigma) for reach in (0, STRIDE))
-    alike, alike_on_average = (pairs[:, similar > ALIKE] for similar in (similarity, on_average))
+    pairs = _neighbours(tracks)
+    similarity = _similarity(pairs, tracks, max(MIN_VELOCITY_SIGMA, VELOCITY_SIGMA * focal_length))
     width = max(MIN_COLUMNS, COLUMNS * focal_length)
-    guess, trust, floats = _first_guess(tracks, sights, alike, alike_on_average, width)
+    feet = _feet(tracks, ~sights.background, height)
+    guess = _first_guess(tracks, sights, pairs[:, similarity > ALIKE], feet, width)
     smoothness = _smoothness(tracks, pairs, similarity)
     rays = sights.rays / sights.horizontal[:, None]
     windows = parallax.find_windows(tracks.numbers, sights.times, sights.centres, rays)
-    mean = _combinations(len(guess), tuple(windows.places.T), (0.25,) * 4, 1.0)
-    found = guess
+    mean = _combinations(len(rays), tuple(windows.places.T), (0.25,) * 4, 1.0)
+    found = guess.logs
     for _ in range(ITERATIONS):  # least absolute errors by reweighted least squares
-        weights = trust / np.maximum(np.abs(found - guess), SMALL_ERROR)
-        weights = np.where(floats & (found < guess), FLOATING_WEIGHT, 1) * weights
+        weights = guess.trust / np.maximum(np.abs(found - guess.logs), SMALL_ERROR)
+        weights = np.where(guess.floats & (found < guess.logs), FLOATING_WEIGHT, 1) * weights
         shaking, certainty = parallax.estimates(windows, found, focal_length)
         normal = (sparse.diags_array(weights) + smoothness + mean.T @ sparse.diags_array(certainty) @ mean).tocsr()
-        residual = weights * (guess - found) - smoothness @ found + mean.T @ (certainty * (shaking - mean @ found))
+        residual = weights * (guess.logs - found) - smoothness @ found + mean.T @ (certainty * (shaking - mean @ found))
         # Solving for the step makes its accuracy independent of the scene's unit.
         step, _ = cg(normal, residual, rtol=STEP_TOLERANCE, maxiter=500, M=sparse.diags_array(1 / normal.diagonal()))
         found = found + step
@@ -145,7 +151,7 @@ class _Guess(NamedTuple):
     Attributes:
         logs: of the distances.
         trust: weights of their absolute errors; 0 where nothing is known, and the guess is the mean of all others.
-        floats: whether nothing that the object hides is the ground.
+        floats: whether it comes from no foot of the object.
     """
 
     logs: Float[np.ndarray, " O"]
@@ -154,28 +160,38 @@ class _Guess(NamedTuple):
 
 
 def _first_guess(
-    tracks: Tracks, sights: Sights, alike: Int[np.ndarray, "2 E"], on_average: Int[np.ndarray, "2 A"], width: float
+    tracks: Tracks, sights: Sights, alike: Int[np.ndarray, "2 E"], feet: Bool[np.ndarray, " O"], width: float
 ) -> _Guess:
-    """Given distances, or the nearest that objects hide up to `width` pixels to either side.
+    """Given distances, or the nearest that the feet of objects or, where there are none, all of their parts hide.
 
     Args:
         tracks: their observations.
         sights: what is known about them.
         alike: pairs of observations that move alike.
-        on_average: pairs that do so on average over a longer time.
+        feet: which observations are feet of objects.
         width: of the columns in which objects hide what counts, to either side.
     """
-    floats = sights.hidden < ON_GROUND * sights.ground
-    on_ground = ~floats & (sights.hidden < sights.ground / ON_GROUND)
-    behind = sights.horizontal * np.where(on_ground, sights.ground, sights.hidden)
-    nearest, of_body = (_nearest_hidden(tracks, behind, pairs, width) for pairs in (alike, on_average))
-    nearest = np.where(floats[nearest] & (behind[of_body] < behind[nearest]), of_body, nearest)
+    hidden = sights.horizontal * sights.hidden
+    by_feet = np.where(feet, hidden, np.nan)
+    nearest, foot = (_nearest_hidden(tracks, distances, alike, width) for distances in (hidden, by_feet))
+    stands = np.isfinite(by_feet[foot])
     told = sights.horizontal * sights.given
     is_told = np.isfinite(told)
-    logs = np.log(np.where(is_told, told, behind[nearest]))
+    logs = np.log(np.where(is_told, told, hidden[np.where(stands, foot, nearest)]))
     known = np.isfinite(logs)
     trust = TYPICAL_ERROR * known * np.where(is_told, GIVEN_WEIGHT, 1)
-    return _Guess(np.where(known, logs, logs[known].mean()), trust, floats[nearest] & ~is_told)
+    return _Guess(np.where(known, logs, logs[known].mean()), trust, ~stands & ~is_told)
+
+
+def _feet(tracks: Tracks, foreground: Bool[np.ndarray, " O"], height: int) -> Bool[np.ndarray, " O"]:
+    """Which foreground observations have none of these just below, and are not at the lower border of the frame."""
+    low, high = BELOW
+    middle, box = np.array([0, (low + high) / 2]), np.array([BESIDE, (high - low) / 2])
+    feet = foreground & (tracks.pixels[:, 1] + high < height)
+    for group in _by_frame(tracks):
+        pixels, tree = tracks.pixels[group], cKDTree(tracks.pixels[group][foreground[group]] / box)
+        feet[group] &= tree.query_ball_point((pixels + middle) / box, 1.0, p=np.inf, return_length=True) == 0
+    return feet
 
 
 def _smoothness(tracks: Tracks, pairs: Int[np.ndarray, "2 E"], similarity: Float[np.ndarray, " E"]) -> sparse.csr_array:
@@ -222,18 +238,26 @@ def _neighbours(tracks: Tracks) -> Int[np.ndarray, "2 E"]:
     return np.concatenate([group[close(tracks.pixels[group])] for group in _by_frame(tracks)]).T
 
 
-def _similarity(pairs: Int[np.ndarray, "2 E"], tracks: Tracks, reach: int, sigma: float) -> Float[np.ndarray, " E"]:
-    """How similarly pairs of observations move, in (0, 1], on average over `reach` more frames before and after."""
-    velocities = np.concatenate([_velocities(pixels, reach) for pixels in by_track(tracks, tracks.pixels)])
-    first, second = velocities[pairs]
-    return np.exp(-np.square(first - second).sum(-1) / (2 * sigma**2))
+def _similarity(pairs: Int[np.ndarray, "2 E"], tracks: Tracks, sigma: float) -> Float[np.ndarray, " E"]:
+    """How similarly pairs of observations move, in (0, 1], as long as both their tracks are seen.
+
+    At an instant, things that are near each other in the picture may well move alike by chance.
+    """
+    _, numbers = np.unique(tracks.numbers, return_inverse=True)
+    count = numbers.max() + 1
+    velocities = np.full((count, tracks.frames.max() + 1, 2), np.nan, np.float32)
+    velocities[numbers, tracks.frames] = np.concatenate([_velocities(x) for x in by_track(tracks, tracks.pixels)])
+    first, second = numbers[pairs]
+    which, places = np.unique(first * count + second, return_inverse=True)
+    parts = np.split(which, range(PAIRS, len(which), PAIRS))
+    squares = [np.square(velocities[part // count] - velocities[part % count]).sum(-1) for part in parts]
+    return np.exp(-np.concatenate([np.nanmean(x, axis=1) for x in squares])[places] / (2 * sigma**2))
 
 
-def _velocities(pixels: Float[np.ndarray, "O 2"], reach: int) -> Float[np.ndarray, "O 2"]:
-    """Mean pixels per frame around each step of a track to its next observation; the last repeats the one before."""
-    places, last = np.arange(len(pixels)), len(pixels) - 1
-    start, end = np.clip(places - reach, 0, last - 1), np.clip(places + reach + 1, 1, last)
-    return (pixels[end] - pixels[start]) / (end - start)[:, None]
+def _velocities(pixels: Float[np.ndarray, "O 2"]) -> Float[np.ndarray, "O 2"]:
+    """Pixels per frame from each observation of a track to its next; the last repeats the one before."""
+    steps = np.diff(pixels, axis=0)
+    return np.concatenate([steps, steps[-1:]])
 
 
 def _combinations(

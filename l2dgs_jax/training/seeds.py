@@ -15,15 +15,17 @@ from l2dgs_jax.cameras.ground import Ground, find_ground, ground_depths, horizon
 from l2dgs_jax.data.dataset import Split
 from l2dgs_jax.model.deformation import path_weights
 from l2dgs_jax.model.initialisation import Seeds, path_knots, z_order
-from l2dgs_jax.training.depths import Sights, depths_around, depths_at, shared_depths
+from l2dgs_jax.training.background import looks_like_background
+from l2dgs_jax.training.depths import Sights, depths_around, depths_at, shared_depths, with_ground
 from l2dgs_jax.training.flows import neighbour_flows
 from l2dgs_jax.training.given_depth import in_world_units
-from l2dgs_jax.training.tracks import SPACING, Tracks, by_track, find_tracks
+from l2dgs_jax.training.tracks import SPACING, Tracks, by_track, find_tracks, share_in_track
 
 MIN_LENGTH = 3  # frames that a track must be seen in
 MIN_MOVING_SHARE = 0.4  # share of these frames in which it must be seen to move
 MIN_DEVIATION = 3.0  # pixels that a track must at some time be away from where a static point would appear
 MIN_HORIZONTAL = 0.2  # horizontal distance per unit of depth below which a camera looks down too steeply
+BACKGROUND_SHARE = 0.5  # share of a track's observations, from which on it is the background that the track shows
 STIFFNESS = 1e-3  # weight of squared second differences of a path, relative to squared distances from the track
 
 
@@ -50,8 +52,8 @@ def find_seeds(points: Float[np.ndarray, "P 3"], split: Split, most: int) -> See
         return Seeds(*(np.zeros(shape, np.float32) for shape in shapes))
     hidden = np.stack([depths.hidden for depths in around])
     given = _given_depths(chosen, cameras, points, split)
-    sights = _sights(chosen, cameras, find_ground(points, cameras.viewmat), depths_at(chosen, hidden), given)
-    depths = shared_depths(chosen, sights, focal_length=float(cameras.K[:, 0, 0].mean()))
+    sights = _sights(chosen, split, cameras, find_ground(points, cameras.viewmat), depths_at(chosen, hidden), given)
+    depths = _depths(chosen, sights, float(cameras.K[:, 0, 0].mean()), height)
     parts = zip(*(by_track(chosen, x) for x in (*chosen, depths)), strict=True)
     seeds = [_seed(split, cameras, weights, Tracks(*track), depth) for *track, depth in parts]
     found = Seeds(*(np.array(rows, np.float32) for rows in zip(*seeds, strict=True)))
@@ -90,6 +92,17 @@ def _moving_tracks(tracks: Tracks, cameras: _Cameras, depths: Float32[np.ndarray
     return Tracks(*(x[observed] for x in tracks))
 
 
+def _depths(tracks: Tracks, sights: Sights, focal_length: float, height: int) -> Float[np.ndarray, " O"]:
+    """Depths of the observations, world units; tracks that show the background lie on it."""
+    depths = sights.hidden.copy()
+    shows_background = share_in_track(tracks, sights.background) > BACKGROUND_SHARE
+    others = ~shows_background | (share_in_track(tracks, np.isnan(depths)) > 0)
+    if np.isfinite(depths[others]).any():
+        tracks, sights = Tracks(*(x[others] for x in tracks)), Sights(*(x[others] for x in sights))
+        depths[others] = shared_depths(tracks, sights, focal_length, height)
+    return depths
+
+
 def _seed(
     split: Split,
     cameras: _Cameras,
@@ -124,23 +137,26 @@ def _fitted_path(weights: Float[np.ndarray, "O K"], places: Float[np.ndarray, "O
 
 def _sights(
     tracks: Tracks,
+    split: Split,
     cameras: _Cameras,
     ground: Ground | None,
     hidden: Float32[np.ndarray, " O"],
     given: Float[np.ndarray, " O"],
 ) -> Sights:
-    """What cameras, ground and depths tell about the observations.
+    """What frames, cameras, ground and depths tell about the observations.
 
     Where cameras look too steeply, horizontal distances are treated as unknown.
     """
     viewmat, K = cameras.viewmat[tracks.frames], cameras.K[tracks.frames]
-    horizontal, level = np.ones(len(hidden)), np.full(len(hidden), np.nan)
+    horizontal, hidden = np.ones(len(hidden)), hidden.astype(np.float64)
     if ground is not None:
-        level = ground_depths(tracks.pixels, viewmat, K, ground)
+        hidden = with_ground(hidden, ground_depths(tracks.pixels, viewmat, K, ground))
         per_depth = horizontal_per_depth(tracks.pixels, viewmat, K, ground.up)
         horizontal = per_depth if per_depth.min() > MIN_HORIZONTAL else horizontal
+    surfaces = _unprojected(tracks, cameras, hidden)
+    background = looks_like_background(tracks, split, surfaces, cameras.viewmat, cameras.K)
     times, rays = cameras.time[tracks.frames], pixel_rays(tracks.pixels, viewmat, K)
-    return Sights(times, camera_centres(viewmat), rays, horizontal, hidden, level, given)
+    return Sights(times, camera_centres(viewmat), rays, horizontal, hidden, given, background)
 
 
 def _given_depths(

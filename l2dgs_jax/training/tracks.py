@@ -41,6 +41,12 @@ def by_track(tracks: Tracks, values: Shaped[np.ndarray, "O ..."]) -> list[Shaped
     return np.split(values, np.flatnonzero(np.diff(tracks.numbers)) + 1)
 
 
+def share_in_track(tracks: Tracks, which: Bool[np.ndarray, " O"]) -> Float[np.ndarray, " O"]:
+    """Share of the observations of each one's track for which something holds."""
+    _, numbers = np.unique(tracks.numbers, return_inverse=True)
+    return (np.bincount(numbers, which) / np.bincount(numbers))[numbers]
+
+
 class _Heads(NamedTuple):
     """The tracks that have come to a frame: number, pixel, and average deviation from a static scene in pixels."""
 

@@ -5,7 +5,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from l2dgs_jax.cameras.geometry import pixel_rays
-from l2dgs_jax.training.depths import Sights, depths_around, depths_at, shared_depths
+from l2dgs_jax.training.depths import Sights, depths_around, depths_at, shared_depths, with_ground
 from l2dgs_jax.training.tracks import DEPTH_CELL, Tracks, by_track
 
 HEIGHT, WIDTH, FRAMES = 24, 32, 8
@@ -22,7 +22,7 @@ def cells(value=2.0):
     return np.full((FRAMES, HEIGHT // DEPTH_CELL, WIDTH // DEPTH_CELL), value, np.float32)
 
 
-def solved(tracks, hidden, factors=1.0, ground=np.nan, given=np.nan, focal_length=200.0):
+def solved(tracks, hidden, factors=1.0, ground=np.nan, given=np.nan, focal_length=200.0, height=1000, background=None):
     """Depths of tracks seen by a resting camera.
 
     Depths and factors are the same for all, or have a row for each track or a column for each frame.
@@ -32,8 +32,10 @@ def solved(tracks, hidden, factors=1.0, ground=np.nan, given=np.nan, focal_lengt
     count = len(merged.frames)
     rays = pixel_rays(merged.pixels, np.broadcast_to(np.eye(4), (count, 4, 4)), np.broadcast_to(K, (count, 3, 3)))
     times, centres = merged.frames / FRAMES, np.zeros((count, 3))
-    sights = Sights(times, centres, rays, factors, depths_at(merged, hidden), ground, given)
-    return by_track(merged, shared_depths(merged, sights, focal_length))
+    behind = with_ground(depths_at(merged, hidden).astype(float), ground)
+    background = np.zeros(count, bool) if background is None else background.ravel()
+    sights = Sights(times, centres, rays, factors, behind, given, background)
+    return by_track(merged, shared_depths(merged, sights, focal_length, height))
 
 
 def test_depths_around_are_ordered_and_lie_within_those_of_the_points():
@@ -82,7 +84,7 @@ def test_an_object_is_as_near_as_the_nearest_surface_that_it_hides():
 
 
 @pytest.mark.parametrize("scale", [1, 2, 4])
-@pytest.mark.parametrize(("difference", "together"), [(0.3, True), (0.6, False)])
+@pytest.mark.parametrize(("difference", "together"), [(0.6, True), (1.6, False)])
 def test_what_belongs_together_does_not_depend_on_the_size_of_the_picture(scale, difference, together):
     side, middle = 160 * scale, 80 * scale
     depths = np.full((FRAMES, side // DEPTH_CELL, side // DEPTH_CELL), 4.0, np.float32)
@@ -117,25 +119,52 @@ def test_an_object_on_the_ground_is_as_far_away_as_its_plane_not_as_the_points_a
     assert_allclose(foot, 2, rtol=1e-3)
 
 
-def test_a_trunk_before_a_wall_is_drawn_to_the_leg_that_reaches_the_ground():
-    depths = cells(4.0)
-    depths[:, 4:] = 2.0
-    body = [track(i, (8.5, 1.5 + 5 * i), (1.0 if i < 3 else 1.4, 0)) for i in range(5)]
-    ground = np.array([[9.0], [9.0], [9.0], [2.0], [2.0]])
-    assert solved(body, depths)[0].min() > 3.5
-    assert solved(body, depths, ground=ground)[0].max() < 3
+def test_what_an_object_hides_above_its_foot_does_not_count():
+    depths = cells(2.0)
+    depths[:, 2] = 1.5  # a few points of something else
+    body = [track(i, (4.5, 1.5 + 4 * i), (1, 0)) for i in range(5)]
+    assert_allclose(solved(body, depths), 2, rtol=1e-3)
+    assert np.max(solved(body[:3], depths)) < 1.6
 
 
-def test_a_leg_that_swings_belongs_to_the_trunk_that_it_moves_with_on_average():
+def test_an_object_above_another_has_its_foot_behind_it_and_may_be_nearer_than_what_it_hides():
     depths = cells(4.0)
     depths[:, 4:] = 2.0
-    swing = np.stack([np.arange(FRAMES) % 2, np.zeros(FRAMES)], axis=-1)  # by a pixel, too fast to seem one object
-    trunk, leg = ([track(i, (8.5, 1.5 + 5 * i), (1.0, 0)) for i in numbers] for numbers in (range(3), range(3, 5)))
-    ground = np.array([[9.0], [9.0], [9.0], [2.0], [2.0]])
-    swinging = [part._replace(pixels=part.pixels + swing) for part in leg]
-    assert_allclose(solved([*trunk, *swinging], depths, ground=ground), 2, rtol=0.1)
-    leaving = [part._replace(pixels=part.pixels + 2 * np.arange(FRAMES)[:, None] * (1, 0)) for part in leg]
-    assert solved([*trunk, *leaving], depths, ground=ground)[0].min() > 3
+    upper, lower = (
+        [track(i, (8.5, 1.5 + 4 * i), (v, 0)) for i in rows] for rows, v in ((range(4), 1), (range(4, 6), 0.2))
+    )
+    alone, above = solved(upper, depths), solved([*upper, *lower], depths)
+    assert_allclose(alone, 4, rtol=1e-3)  # all of the ground below it is in view
+    assert np.max(above[:4]) < 3.7
+    assert_allclose(above[4:], 2, rtol=0.1)
+
+
+def test_a_shadow_below_an_object_is_not_its_foot():
+    depths = cells(4.0)
+    depths[:, 3:] = 3.0
+    depths[:, 4:] = 2.0
+    rows = [track(i, (8.5, 1.5 + 4 * i), (1, 0)) for i in range(5)]
+    shadow = np.repeat(np.arange(5) == 4, FRAMES)
+    assert_allclose(solved(rows, depths), 2, rtol=1e-3)
+    assert_allclose(solved(rows, depths, background=shadow), 3, rtol=1e-3)
+
+
+def test_an_object_at_the_lower_border_may_be_nearer_than_what_it_hides():
+    near = cells()
+    near[FRAMES // 2 :] = 4.0
+    leaving = [track(0, (4.5, 4.5), (1, 2))]
+    last = {height: solved(leaving, near, height=height)[0][-1] for height in (22, 1000)}
+    assert last[22] < last[1000] - 0.3
+
+
+def test_things_that_move_alike_for_a_while_are_not_one_object():
+    depths = cells(4.0)
+    depths[:, 4:] = 2.0
+    upper, lower = ([track(i, (8.5, 1.5 + 4 * i), (1, 0)) for i in rows] for rows in (range(4), range(4, 6)))
+    assert_allclose(solved([*upper, *lower], depths), 2, rtol=1e-3)
+    turning = np.where(np.arange(FRAMES) < FRAMES // 2, 0, 3 * (np.arange(FRAMES) - FRAMES // 2))[:, None] * (1, 0)
+    parting = [part._replace(pixels=part.pixels + turning) for part in lower]
+    assert solved([*upper, *parting], depths)[0][0] > 3
 
 
 def test_a_few_wrong_depths_do_not_move_a_track():
@@ -180,9 +209,9 @@ def shaken(amount, guess, factor=1.0, unit=1.0):
     rays = (path - centres) / 2
     track = Tracks(np.zeros(frames, int), np.arange(frames), 30.0 * rays[:, :2] + 50, np.ones(frames, bool))
     unknown, hidden = np.full(frames, np.nan), np.full(frames, guess * unit)
-    factors = np.full(frames, factor)
-    sights = Sights(track.frames / frames, centres * unit, rays, factors, hidden, unknown, unknown)
-    return shared_depths(track, sights, 200.0) / (2.0 * unit)
+    factors, none = np.full(frames, factor), np.zeros(frames, bool)
+    sights = Sights(track.frames / frames, centres * unit, rays, factors, hidden, unknown, none)
+    return shared_depths(track, sights, 200.0, 1000) / (2.0 * unit)
 
 
 @pytest.mark.parametrize("guess", [1.0, 4.0])

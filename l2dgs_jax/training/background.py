@@ -1,0 +1,73 @@
+"""What seems to move, but is the static scene: shadows, and what flow drags along beside moving objects."""
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Float32
+
+from l2dgs_jax.cameras.geometry import project_points
+from l2dgs_jax.data.color import srgb_to_linear
+from l2dgs_jax.data.dataset import Split
+from l2dgs_jax.training.tracks import Tracks
+
+MAX_FRAMES = 60  # frames that colours of static surfaces are taken from
+MIN_SEEN = 3  # of these, in which a surface must be seen
+REACH = 9  # side in pixels of the square around an observation in which static surfaces may be hidden
+BLUR_SIGMA = 1.0  # standard deviation in pixels of the Gaussian that suppresses noise
+DARKNESS = 0.3  # of the median light; darker colours are mostly noise, and count as this
+SHADE = 0.35, 1.1  # light in a shadow over that outside, at least and at most
+TINT = 0.15  # difference in log-light of a channel from the mean of all channels: a shadow changes colours little
+
+
+def looks_like_background(
+    tracks: Tracks,
+    split: Split,
+    surfaces: Float[np.ndarray, "O 3"],
+    viewmats: Float[np.ndarray, "F 4 4"],
+    Ks: Float[np.ndarray, "F 3 3"],
+) -> Bool[np.ndarray, " O"]:
+    """Which observations have the colours of the static surfaces behind them, or darker ones.
+
+    These surfaces are seen in other frames, where nothing moves before them. Where they are not, the answer is no.
+
+    Args:
+        tracks: that seem to move.
+        split: the frames.
+        surfaces: points on the surfaces behind the observations, world units; NaN where unknown.
+        viewmats: of the cameras, in double precision.
+        Ks: likewise.
+    """
+    height, width = split.images.shape[1:3]
+    columns, rows = tracks.pixels.astype(int).T
+    chosen = np.unique(np.linspace(0, len(viewmats) - 1, MAX_FRAMES).round().astype(int)).tolist()
+    elsewhere = np.full((len(chosen), len(surfaces), 3), np.nan, np.float32)
+    here = np.zeros((len(surfaces), 3), np.float32)
+    for frame in range(len(viewmats)):
+        light = _smooth_light(split.images[frame])
+        observed = tracks.frames == frame
+        here[observed] = light[rows[observed], columns[observed]]
+        if frame in chosen:
+            hidden = np.zeros((height, width), np.uint8)
+            hidden[rows[observed], columns[observed]] = 1
+            free = cv2.dilate(hidden, np.ones((REACH, REACH), np.uint8)) == 0
+            pixels, depth = project_points(surfaces, viewmats[frame], Ks[frame])
+            seen = np.flatnonzero((depth > 0) & ((pixels >= 0) & (pixels < (width, height))).all(-1))  # never NaN
+            column, row = pixels[seen].astype(int).T
+            at = free[row, column]
+            elsewhere[chosen.index(frame), seen[at]] = light[row[at], column[at]]
+    known = np.isfinite(elsewhere[..., 0]).sum(0) >= MIN_SEEN
+    if known.any():
+        known[known] = _alike(here[known], np.nanmedian(elsewhere[:, known], axis=0))
+    return known
+
+
+def _alike(here: Float32[np.ndarray, "N 3"], elsewhere: Float32[np.ndarray, "N 3"]) -> Bool[np.ndarray, " N"]:
+    """Whether light is that of the same surface, or of its shadow."""
+    least = DARKNESS * np.median(elsewhere)
+    change = np.log(np.maximum(here, least) / np.maximum(elsewhere, least))
+    mean = change.mean(-1)
+    tint = np.abs(change - mean[:, None]).max(-1)
+    return (tint < TINT) & (mean > np.log(SHADE[0])) & (mean < np.log(SHADE[1]))
+
+
+def _smooth_light(image: Float[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "H W 3"]:
+    return cv2.GaussianBlur(srgb_to_linear(image.astype(np.float32)), (0, 0), BLUR_SIGMA)
