@@ -49,6 +49,8 @@ def looks_like_background(
             hidden = np.zeros((height, width), np.uint8)
             hidden[rows[observed], columns[observed]] = 1
             free = cv2.dilate(hidden, np.ones((REACH, REACH), np.uint8)) == 0
+            if split.valid is not None:
+                free &= split.valid[frame]
             pixels, depth = project_points(surfaces, viewmats[frame], Ks[frame])
             seen = np.flatnonzero((depth > 0) & ((pixels >= 0) & (pixels < (width, height))).all(-1))  # never NaN
             column, row = pixels[seen].astype(int).T

@@ -82,6 +82,14 @@ def test_a_surface_that_is_unknown_or_never_seen_elsewhere_is_not_shown(moved):
     assert shares["shadow"] == 0
 
 
+def test_pixels_that_are_not_valid_do_not_tell():
+    split, tracks = seen()
+    valid = np.ones(split.images.shape[:3], bool)
+    valid[:-2] = False
+    shares = found(dataclasses.replace(split, valid=valid), tracks, surfaces(tracks))
+    assert shares["shadow"] == 0
+
+
 @pytest.mark.parametrize("frames", [5, 1000])
 def test_a_few_frames_tell_what_the_background_looks_like(frames, monkeypatch):
     monkeypatch.setattr(background, "MAX_FRAMES", frames)
