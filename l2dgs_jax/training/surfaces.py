@@ -27,7 +27,6 @@ from l2dgs_jax.types import Camera
 
 MAX_FRAMES = 100  # frames whose depth maps are computed
 MAX_POINTS = 1000  # points by which parallax is measured
-MAX_GAP = 10  # instants between matched frames
 PARALLAXES = (2, 5, 10, 20)  # pixels; for each, the nearest frame on either side with so much parallax is matched
 MAX_SHIFT = 0.15  # median displacement of points between matched frames, over the width: beyond it flow fails
 MAX_FORWARD_BACKWARD_ERROR = 1.0  # pixels; matches of a larger error are not trusted
@@ -193,17 +192,17 @@ def _frames_to_match(
     offsets = instants - instants[frame]
     chosen: set[int] = set()
     for side in (offsets <= 0, offsets >= 0):
-        near = np.flatnonzero(side & (np.abs(offsets) <= MAX_GAP))
-        near = near[np.argsort(np.abs(offsets[near]), kind="stable")].tolist()
-        parallaxes = []
-        for other in near:
+        others, missing = np.flatnonzero(side), np.array(PARALLAXES)
+        for other in others[np.argsort(np.abs(offsets[others]), kind="stable")].tolist():
             geometry = epipolar_geometry(cameras, frame, other)
             ends = project(geometry, seen, 1 / depth)
             shift = np.median(np.linalg.norm(ends - seen, axis=-1))
             parallax = np.median(np.linalg.norm(ends - project(geometry, seen, 0 * depth), axis=-1))
-            parallaxes.append(parallax if shift < max_shift else 0)
-        enough = np.array(parallaxes)[:, None] >= PARALLAXES
-        chosen.update(near[first] for first in enough.argmax(0)[enough.any(0)].tolist())
+            if shift < max_shift and parallax >= missing[0]:
+                chosen.add(other)
+                missing = missing[missing > parallax]
+                if not len(missing):
+                    break
     return sorted(chosen)
 
 

@@ -166,3 +166,13 @@ def test_depth_maps_are_computed_for_at_most_max_frames(monkeypatch):
     monkeypatch.setattr(surfaces, "MAX_FRAMES", 4)
     split, _ = filmed()
     np.testing.assert_allclose([m.viewmat for m in depth_maps(sparse(), split)], split.cameras.viewmat[[0, 3, 6, 9]])
+
+
+def test_a_camera_may_move_slowly(monkeypatch):
+    monkeypatch.setattr(surfaces, "MAX_FRAMES", 4)
+    count = 80
+    pictures, views, _ = clip(count, reach=0.1, light=0.2)
+    times = np.linspace(0, 1, count, dtype=np.float32)
+    cameras = Camera(np.stack(views).astype(np.float32), np.tile(K, (count, 1, 1)), times)
+    slow = Split(tuple(map(str, range(count))), cameras, np.stack(pictures).astype(np.float16))
+    assert np.mean([np.isfinite(depths.inverse) for depths in depth_maps(sparse(), slow)]) > 0.5
