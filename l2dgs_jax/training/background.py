@@ -2,16 +2,17 @@
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Bool, Float, Float32, Int
 
 from l2dgs_jax.cameras.geometry import project_points
 from l2dgs_jax.data.color import srgb_to_linear
 from l2dgs_jax.data.dataset import Split
+from l2dgs_jax.training.backdrop import Backdrop, hidden_depths, unprojected
 from l2dgs_jax.training.tracks import Tracks
 
 MAX_FRAMES = 60  # frames that colours of static surfaces are taken from
 MIN_SEEN = 3  # of these, in which a surface must be seen
-REACH = 9  # side in pixels of the square around an observation in which static surfaces may be hidden
+REACH = 9  # side in pixels of the square around a track in which static surfaces may be hidden
 BLUR_SIGMA = 1.0  # standard deviation in pixels of the Gaussian that suppresses noise
 DARKNESS = 0.3  # of the median light; darker colours are mostly noise, and count as this
 SHADE = 0.35, 1.1  # light in a shadow over that outside, at least and at most
@@ -19,41 +20,44 @@ TINT = 0.15  # difference in log-light of a channel from the mean of all channel
 
 
 def looks_like_background(
-    tracks: Tracks,
+    frames: Int[np.ndarray, " N"],
+    pixels: Float[np.ndarray, "N 2"],
     split: Split,
-    surfaces: Float[np.ndarray, "O 3"],
-    viewmats: Float[np.ndarray, "F 4 4"],
-    Ks: Float[np.ndarray, "F 3 3"],
-) -> Bool[np.ndarray, " O"]:
-    """Which observations have the colours of the static surfaces behind them, or darker ones.
+    backdrop: Backdrop,
+    tracks: Tracks,
+) -> Bool[np.ndarray, " N"]:
+    """Which pixels of frames have the colours of the static surfaces behind them, or darker ones.
 
     These surfaces are seen in other frames, where nothing moves before them. Where they are not, the answer is no.
 
     Args:
-        tracks: that seem to move.
-        split: the frames.
-        surfaces: points on the surfaces behind the observations, world units; NaN where unknown.
-        viewmats: of the cameras, in double precision.
-        Ks: likewise.
+        frames: indices of the frames.
+        pixels: within the frames.
+        split: all frames.
+        backdrop: of these.
+        tracks: what seems to move there.
     """
     height, width = split.images.shape[1:3]
-    columns, rows = tracks.pixels.astype(int).T
+    viewmats, Ks, _ = backdrop.cameras
+    surfaces = unprojected(backdrop.cameras, frames, pixels, hidden_depths(backdrop, frames, pixels))
     chosen = np.unique(np.linspace(0, len(viewmats) - 1, MAX_FRAMES).round().astype(int)).tolist()
     elsewhere = np.full((len(chosen), len(surfaces), 3), np.nan, np.float32)
     here = np.zeros((len(surfaces), 3), np.float32)
     for frame in range(len(viewmats)):
         light = _smooth_light(split.images[frame])
-        observed = tracks.frames == frame
-        here[observed] = light[rows[observed], columns[observed]]
+        asked = frames == frame
+        column, row = pixels[asked].astype(int).T
+        here[asked] = light[row, column]
         if frame in chosen:
             hidden = np.zeros((height, width), np.uint8)
-            hidden[rows[observed], columns[observed]] = 1
+            column, row = tracks.pixels[tracks.frames == frame].astype(int).T
+            hidden[row, column] = 1
             free = cv2.dilate(hidden, np.ones((REACH, REACH), np.uint8)) == 0
             if split.valid is not None:
                 free &= split.valid[frame]
-            pixels, depth = project_points(surfaces, viewmats[frame], Ks[frame])
-            seen = np.flatnonzero((depth > 0) & ((pixels >= 0) & (pixels < (width, height))).all(-1))  # never NaN
-            column, row = pixels[seen].astype(int).T
+            places, depth = project_points(surfaces, viewmats[frame], Ks[frame])
+            seen = np.flatnonzero((depth > 0) & ((places >= 0) & (places < (width, height))).all(-1))  # never NaN
+            column, row = places[seen].astype(int).T
             at = free[row, column]
             elsewhere[chosen.index(frame), seen[at]] = light[row[at], column[at]]
     known = np.isfinite(elsewhere[..., 0]).sum(0) >= MIN_SEEN

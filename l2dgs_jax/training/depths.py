@@ -4,30 +4,23 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int
+from jaxtyping import Bool, Float, Int
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import cg
 from scipy.spatial import cKDTree
 
-from l2dgs_jax.cameras.geometry import project_points
 from l2dgs_jax.training import parallax
-from l2dgs_jax.training.tracks import DEPTH_CELL, Tracks, by_track
+from l2dgs_jax.training.feet import just_below
+from l2dgs_jax.training.tracks import Tracks, by_frame, by_track
 
-NEIGHBOURS = 30  # nearest points of a pixel that depths are taken from
-STATIC_QUANTILES = 0.03, 0.97  # of their depths, between which static surfaces may lie: a few points are outliers
-CANDIDATES = 4  # depths in that range, evenly spaced in inverse depth
-BORDER = 0.1  # distance from the picture within which points still count, in focal lengths
 NEIGHBOUR_RADIUS = 9.0  # pixels within which tracks may belong to one object
 VELOCITY_SIGMA = 0.004  # standard deviation of velocities within one object, in focal lengths per frame
 MIN_VELOCITY_SIGMA = 0.75  # at least this, pixels per frame: flow has errors
 ALIKE = 0.5  # similarity of motion from which neighbours belong to one object
 PAIRS = 20_000  # pairs of tracks that are compared at a time
-BELOW = 1.5, 9.0  # pixels below an observation between which nothing moves if it is the foot of an object
-BESIDE = 4.5  # and to either side
 COLUMNS = 0.03  # distance to either side in which what an object hides counts, in focal lengths
 MIN_COLUMNS = 6.0  # at least this distance, pixels
-ON_GROUND = 0.8  # a surface is taken for the ground from this share of the ground's depth there up to its inverse
 # Weights of squared differences of log-distances; the absolute error of the guess counts `TYPICAL_ERROR` times
 NEIGHBOUR_WEIGHT = 1.0  # between neighbours, times the similarity of their motion
 CURVATURE_WEIGHT = 1000.0  # second differences along a track
@@ -40,18 +33,6 @@ ITERATIONS = 15
 STEP_TOLERANCE = 1e-3  # of the residual, in each of them
 
 
-class Depths(NamedTuple):
-    """Depths that the points around each cell of F frames suggest, world units; NaN in frames that show no points.
-
-    Attributes:
-        still: C candidates for static surfaces, the nearest first.
-        hidden: of the surface that something there would hide.
-    """
-
-    still: Float32[np.ndarray, "C *F h w"]
-    hidden: Float32[np.ndarray, "*F h w"]
-
-
 class Sights(NamedTuple):
     """What cameras and scene tell about the O observations of tracks, in their order; depths are NaN where unknown.
 
@@ -61,8 +42,9 @@ class Sights(NamedTuple):
         rays: from there through the pixels, per unit of depth.
         horizontal: horizontal distance per unit of depth, positive; 1 for all if it is unknown where up is.
         hidden: depth of the surface that something there would hide, world units.
-        given: depth that came with the scene, world units.
         background: whether they look like that surface.
+        foot: if they are feet of objects, depth of the ground that the ends of these hide, world units.
+        given: depth that came with the scene, world units.
     """
 
     times: Float[np.ndarray, " O"]
@@ -70,64 +52,30 @@ class Sights(NamedTuple):
     rays: Float[np.ndarray, "O 3"]
     horizontal: Float[np.ndarray, " O"]
     hidden: Float[np.ndarray, " O"]
-    given: Float[np.ndarray, " O"]
     background: Bool[np.ndarray, " O"]
+    foot: Float[np.ndarray, " O"]
+    given: Float[np.ndarray, " O"]
 
 
-def depths_around(
-    points: Float[np.ndarray, "P 3"],
-    viewmat: Float[np.ndarray, "4 4"],
-    K: Float[np.ndarray, "3 3"],
-    height: int,
-    width: int,
-) -> Depths:
-    """Depths in one frame, of points in world units."""
-    pixels, depth = project_points(points, viewmat, K)
-    border = BORDER * K[0, 0]
-    inside = ((pixels > -border) & (pixels < (width + border, height + border))).all(-1)
-    rows, columns = (np.arange(0, size, DEPTH_CELL) + 0.5 * DEPTH_CELL for size in (height, width))
-    if not inside.any():
-        unknown = np.full((1 + CANDIDATES, len(rows), len(columns)), np.nan, np.float32)
-        return Depths(unknown[1:], unknown[0])
-    cells = np.stack(np.meshgrid(columns, rows), axis=-1)
-    _, around = cKDTree(pixels[inside]).query(cells, k=range(1, min(NEIGHBOURS, int(inside.sum())) + 1))
-    low, high = STATIC_QUANTILES
-    near, median, far = np.quantile(depth[inside][around], (low, 0.5, high), axis=-1)
-    return Depths((1 / np.linspace(1 / near, 1 / far, CANDIDATES)).astype(np.float32), median.astype(np.float32))
-
-
-def depths_at(tracks: Tracks, depths: Float32[np.ndarray, "F h w"]) -> Float32[np.ndarray, " O"]:
-    """Depths of the cells that the observations of tracks lie in."""
-    columns, rows = (tracks.pixels // DEPTH_CELL).astype(int).T
-    return depths[tracks.frames, rows, columns]
-
-
-def with_ground(hidden: Float[np.ndarray, " O"], ground: Float[np.ndarray, " O"]) -> Float[np.ndarray, " O"]:
-    """Depths of surfaces: where they are nearly that of the ground's plane, `ground`, this tells them better."""
-    return np.where((ON_GROUND * ground <= hidden) & (ON_GROUND * hidden < ground), ground, hidden)
-
-
-def shared_depths(tracks: Tracks, sights: Sights, focal_length: float, height: int) -> Float[np.ndarray, " O"]:
+def shared_depths(tracks: Tracks, sights: Sights, focal_length: float) -> Float[np.ndarray, " O"]:
     """Depths of all observations of the tracks, solved for jointly, world units.
 
     Solved for are horizontal distances, because they are the same for all parts of an upright object. Most objects
-    stand on something, which is what their feet hide: parts with nothing that moves just below. Where no depth is
-    given, the first guess is the nearest foot of the object, or, if it shows none, the nearest of all that it hides:
-    then it may be nearer at little cost. The guess is also wrong where what seems to be one object is several; so the
-    solution may depart from it, as far as parallax tells, and changes smoothly along a track and between neighbours
-    that move alike.
+    stand on something, which is what their feet hide. Where no depth is given, the first guess is the nearest foot of
+    the object; if it shows none, the distance of what is just below it, such as legs below a trunk that moves
+    otherwise; or else the nearest of all that it hides: then it may be nearer at little cost. The guess is also wrong
+    where what seems to be one object is several; so the solution may depart from it, as far as parallax tells, and
+    changes smoothly along a track and between neighbours that move alike.
 
     Args:
         tracks: at least one observation lies in a cell of known depth.
         sights: what cameras and scene tell about them.
         focal_length: of the cameras, pixels: how far apart and how fast things are is judged by angles.
-        height: of the frames, pixels.
     """
     pairs = _neighbours(tracks)
     similarity = _similarity(pairs, tracks, max(MIN_VELOCITY_SIGMA, VELOCITY_SIGMA * focal_length))
     width = max(MIN_COLUMNS, COLUMNS * focal_length)
-    feet = _feet(tracks, ~sights.background, height)
-    guess = _first_guess(tracks, sights, pairs[:, similarity > ALIKE], feet, width)
+    guess = _first_guess(tracks, sights, pairs[:, similarity > ALIKE], width)
     smoothness = _smoothness(tracks, pairs, similarity)
     rays = sights.rays / sights.horizontal[:, None]
     windows = parallax.find_windows(tracks.numbers, sights.times, sights.centres, rays)
@@ -151,7 +99,7 @@ class _Guess(NamedTuple):
     Attributes:
         logs: of the distances.
         trust: weights of their absolute errors; 0 where nothing is known, and the guess is the mean of all others.
-        floats: whether it comes from no foot of the object.
+        floats: whether it comes from no foot.
     """
 
     logs: Float[np.ndarray, " O"]
@@ -159,39 +107,39 @@ class _Guess(NamedTuple):
     floats: Bool[np.ndarray, " O"]
 
 
-def _first_guess(
-    tracks: Tracks, sights: Sights, alike: Int[np.ndarray, "2 E"], feet: Bool[np.ndarray, " O"], width: float
-) -> _Guess:
+def _first_guess(tracks: Tracks, sights: Sights, alike: Int[np.ndarray, "2 E"], width: float) -> _Guess:
     """Given distances, or the nearest that the feet of objects or, where there are none, all of their parts hide.
 
     Args:
         tracks: their observations.
         sights: what is known about them.
         alike: pairs of observations that move alike.
-        feet: which observations are feet of objects.
         width: of the columns in which objects hide what counts, to either side.
     """
-    hidden = sights.horizontal * sights.hidden
-    by_feet = np.where(feet, hidden, np.nan)
-    nearest, foot = (_nearest_hidden(tracks, distances, alike, width) for distances in (hidden, by_feet))
-    stands = np.isfinite(by_feet[foot])
-    told = sights.horizontal * sights.given
-    is_told = np.isfinite(told)
-    logs = np.log(np.where(is_told, told, hidden[np.where(stands, foot, nearest)]))
+    hidden, foot, given = (sights.horizontal * x for x in (sights.hidden, sights.foot, sights.given))
+    stands = _nearest(tracks, foot, alike, width)
+    rests = _resting(tracks, just_below(tracks, ~sights.background), np.where(np.isnan(foot), np.nan, stands))
+    stands = np.where(np.isnan(stands), rests, stands)
+    guess = np.where(np.isnan(stands), _nearest(tracks, hidden, alike, width), stands)
+    is_given = np.isfinite(given)
+    logs = np.log(np.where(is_given, given, guess))
     known = np.isfinite(logs)
-    trust = TYPICAL_ERROR * known * np.where(is_told, GIVEN_WEIGHT, 1)
-    return _Guess(np.where(known, logs, logs[known].mean()), trust, ~stands & ~is_told)
+    trust = TYPICAL_ERROR * known * np.where(is_given, GIVEN_WEIGHT, 1)
+    return _Guess(np.where(known, logs, logs[known].mean()), trust, np.isnan(stands) & ~is_given)
 
 
-def _feet(tracks: Tracks, foreground: Bool[np.ndarray, " O"], height: int) -> Bool[np.ndarray, " O"]:
-    """Which foreground observations have none of these just below, and are not at the lower border of the frame."""
-    low, high = BELOW
-    middle, box = np.array([0, (low + high) / 2]), np.array([BESIDE, (high - low) / 2])
-    feet = foreground & (tracks.pixels[:, 1] + high < height)
-    for group in _by_frame(tracks):
-        pixels, tree = tracks.pixels[group], cKDTree(tracks.pixels[group][foreground[group]] / box)
-        feet[group] &= tree.query_ball_point((pixels + middle) / box, 1.0, p=np.inf, return_length=True) == 0
-    return feet
+def _resting(tracks: Tracks, below: Int[np.ndarray, "2 E"], feet: Float[np.ndarray, " O"]) -> Float[np.ndarray, " O"]:
+    """Distances from the feet upwards: of what is just below, and of the farthest, as others may be in front of it.
+
+    They are NaN for what has no foot below it, and in `feet` for what is none.
+    """
+    distances = feet.copy()
+    upper, lower = below[:, np.argsort(below[0], kind="stable")]
+    firsts = np.searchsorted(upper, np.arange(len(distances) + 1))
+    for i in np.argsort(-tracks.pixels[:, 1], kind="stable"):  # from the bottom up
+        if np.isnan(distances[i]) and firsts[i] < firsts[i + 1]:
+            distances[i] = np.fmax.reduce(distances[lower[firsts[i] : firsts[i + 1]]])
+    return distances
 
 
 def _smoothness(tracks: Tracks, pairs: Int[np.ndarray, "2 E"], similarity: Float[np.ndarray, " E"]) -> sparse.csr_array:
@@ -206,36 +154,29 @@ def _smoothness(tracks: Tracks, pairs: Int[np.ndarray, "2 E"], similarity: Float
     return sum(term.T @ term for term in terms).tocsr()
 
 
-def _nearest_hidden(
-    tracks: Tracks, behind: Float[np.ndarray, " O"], alike: Int[np.ndarray, "2 E"], width: float
-) -> Int[np.ndarray, " O"]:
-    """For each observation, which one of its object, up to `width` pixels to either side, hides what is nearest.
+def _nearest(
+    tracks: Tracks, distances: Float[np.ndarray, " O"], alike: Int[np.ndarray, "2 E"], width: float
+) -> Float[np.ndarray, " O"]:
+    """For each observation, the least distance of its object up to `width` pixels to either side; NaN if all are.
 
-    An object is what pairs of observations of one frame connect. `behind` are distances, NaN where unknown.
+    An object is what pairs of observations of one frame connect.
     """
-    count = len(behind)
+    count = len(distances)
     _, objects = connected_components(sparse.coo_array((np.ones(alike.shape[1]), alike), (count, count)), False)
     columns = tracks.pixels[:, 0]
-    behind = np.where(np.isnan(behind), np.inf, behind)
-    nearest = np.empty(count, int)
-    for group in _by_frame(tracks):
+    nearest = np.empty(count)
+    for group in by_frame(tracks):
         group = group[np.argsort(objects[group], kind="stable")]
         for part in np.split(group, np.flatnonzero(np.diff(objects[group])) + 1):
             around = np.abs(columns[part][:, None] - columns[part]) <= width
-            nearest[part] = part[np.where(around, behind[part], np.inf).argmin(-1)]
+            nearest[part] = np.fmin.reduce(np.where(around, distances[part], np.nan), axis=-1)
     return nearest
-
-
-def _by_frame(tracks: Tracks) -> list[Int[np.ndarray, " N"]]:
-    """The observations of each frame that has any."""
-    order = np.argsort(tracks.frames, kind="stable")
-    return np.split(order, np.flatnonzero(np.diff(tracks.frames[order])) + 1)
 
 
 def _neighbours(tracks: Tracks) -> Int[np.ndarray, "2 E"]:
     """Pairs of observations that are close to each other in a frame."""
     close = lambda pixels: cKDTree(pixels).query_pairs(NEIGHBOUR_RADIUS, output_type="ndarray")
-    return np.concatenate([group[close(tracks.pixels[group])] for group in _by_frame(tracks)]).T
+    return np.concatenate([group[close(tracks.pixels[group])] for group in by_frame(tracks)]).T
 
 
 def _similarity(pairs: Int[np.ndarray, "2 E"], tracks: Tracks, sigma: float) -> Float[np.ndarray, " E"]:

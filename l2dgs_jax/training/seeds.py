@@ -4,19 +4,29 @@ Points from structure from motion lie on static surfaces. A motion field that st
 out which of them to move where; tracks of optical flow tell before training begins.
 """
 
-from typing import NamedTuple
+from functools import partial
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float, Shaped
 
 from l2dgs_jax.cameras.geometry import camera_centres, pixel_rays, project_points
-from l2dgs_jax.cameras.ground import Ground, find_ground, ground_depths, horizontal_per_depth
+from l2dgs_jax.cameras.ground import horizontal_per_depth
 from l2dgs_jax.data.dataset import Split
 from l2dgs_jax.model.deformation import path_weights
 from l2dgs_jax.model.initialisation import Seeds, path_knots, z_order
+from l2dgs_jax.training.backdrop import (
+    Backdrop,
+    Cameras,
+    depths_at,
+    find_backdrop,
+    floor_depths,
+    hidden_depths,
+    unprojected,
+)
 from l2dgs_jax.training.background import looks_like_background
-from l2dgs_jax.training.depths import Sights, depths_around, depths_at, shared_depths, with_ground
+from l2dgs_jax.training.depths import Sights, shared_depths
+from l2dgs_jax.training.feet import find_feet, find_soles
 from l2dgs_jax.training.flows import neighbour_flows
 from l2dgs_jax.training.given_depth import in_world_units
 from l2dgs_jax.training.tracks import SPACING, Tracks, by_track, find_tracks, share_in_track
@@ -39,21 +49,17 @@ def find_seeds(points: Float[np.ndarray, "P 3"], split: Split, most: int) -> See
         split: the frames.
         most: how many seeds there may be; the longest tracks come first.
     """
-    cameras = _Cameras(*(np.asarray(x, np.float64) for x in split.cameras))
     height, width = split.images.shape[1:3]
-    around = [depths_around(points, *camera[:2], height, width) for camera in zip(*cameras, strict=True)]
-    static = np.stack([depths.still for depths in around], axis=1)
-    tracks = find_tracks(split, neighbour_flows(split), static)
+    backdrop = find_backdrop(points, split.cameras, height, width)
+    cameras = backdrop.cameras
+    tracks = find_tracks(split, neighbour_flows(split), backdrop.depths.still)
     knots = path_knots(len(cameras.time))
     weights = np.asarray(path_weights(jnp.asarray(cameras.time), knots))
-    chosen = _moving_tracks(tracks, cameras, static, most)
+    chosen = _moving_tracks(tracks, backdrop, most)
     if not len(chosen.numbers):
         shapes = ((0, 3), (0, 3), (0,), (0, knots, 3), (0, 2))
         return Seeds(*(np.zeros(shape, np.float32) for shape in shapes))
-    hidden = np.stack([depths.hidden for depths in around])
-    given = _given_depths(chosen, cameras, points, split)
-    sights = _sights(chosen, split, cameras, find_ground(points, cameras.viewmat), depths_at(chosen, hidden), given)
-    depths = _depths(chosen, sights, float(cameras.K[:, 0, 0].mean()), height)
+    depths = _depths(chosen, split, backdrop, _given_depths(chosen, cameras, points, split))
     parts = zip(*(by_track(chosen, x) for x in (*chosen, depths)), strict=True)
     seeds = [_seed(split, cameras, weights, Tracks(*track), depth) for *track, depth in parts]
     found = Seeds(*(np.array(rows, np.float32) for rows in zip(*seeds, strict=True)))
@@ -61,15 +67,7 @@ def find_seeds(points: Float[np.ndarray, "P 3"], split: Split, most: int) -> See
     return Seeds(*(rows[order] for rows in found))
 
 
-class _Cameras(NamedTuple):
-    """A `Camera` in NumPy arrays of double precision."""
-
-    viewmat: Float[np.ndarray, "F 4 4"]
-    K: Float[np.ndarray, "F 3 3"]
-    time: Float[np.ndarray, " F"]
-
-
-def _moving_tracks(tracks: Tracks, cameras: _Cameras, depths: Float32[np.ndarray, "C F h w"], most: int) -> Tracks:
+def _moving_tracks(tracks: Tracks, backdrop: Backdrop, most: int) -> Tracks:
     """The tracks that are long enough and surely move, the longest ones first.
 
     They are seen to move in enough of their frames, and leave the place where their first point, taken as static, would
@@ -79,9 +77,10 @@ def _moving_tracks(tracks: Tracks, cameras: _Cameras, depths: Float32[np.ndarray
     lengths = np.diff(starts, append=len(tracks.numbers))
     if not len(starts):
         return tracks
+    cameras, first = backdrop.cameras, (tracks.frames[starts], tracks.pixels[starts])
     deviations, viewmats, Ks = [], cameras.viewmat[tracks.frames], cameras.K[tracks.frames]
-    for depth in depths:
-        world = np.repeat(_unprojected(tracks, cameras, depths_at(tracks, depth))[starts], lengths, axis=0)
+    for still in backdrop.depths.still:
+        world = np.repeat(unprojected(cameras, *first, depths_at(still, *first)), lengths, axis=0)
         static, _ = project_points(world, viewmats, Ks)
         deviations.append(np.maximum.reduceat(np.linalg.norm(tracks.pixels - static, axis=-1), starts))
     moving_share = np.add.reduceat(tracks.moves, starts) / lengths
@@ -92,20 +91,31 @@ def _moving_tracks(tracks: Tracks, cameras: _Cameras, depths: Float32[np.ndarray
     return Tracks(*(x[observed] for x in tracks))
 
 
-def _depths(tracks: Tracks, sights: Sights, focal_length: float, height: int) -> Float[np.ndarray, " O"]:
+def _depths(
+    tracks: Tracks, split: Split, backdrop: Backdrop, given: Float[np.ndarray, " O"]
+) -> Float[np.ndarray, " O"]:
     """Depths of the observations, world units; tracks that show the background lie on it."""
-    depths = sights.hidden.copy()
-    shows_background = share_in_track(tracks, sights.background) > BACKGROUND_SHARE
+    depths = hidden_depths(backdrop, tracks.frames, tracks.pixels)
+    is_background = partial(looks_like_background, split=split, backdrop=backdrop, tracks=tracks)
+    background = is_background(tracks.frames, tracks.pixels)
+    shows_background = share_in_track(tracks, background) > BACKGROUND_SHARE
     others = ~shows_background | (share_in_track(tracks, np.isnan(depths)) > 0)
     if np.isfinite(depths[others]).any():
-        tracks, sights = Tracks(*(x[others] for x in tracks)), Sights(*(x[others] for x in sights))
-        depths[others] = shared_depths(tracks, sights, focal_length, height)
+        moving = Tracks(*(x[others] for x in tracks))
+        focal_length, height = float(backdrop.cameras.K[:, 0, 0].mean()), split.images.shape[1]
+        feet = find_feet(moving, ~background[others], height)
+        frames = moving.frames[feet]
+        soles = find_soles(frames, moving.pixels[feet], is_background, focal_length, height)
+        foot = np.full(len(feet), np.nan)
+        foot[feet] = floor_depths(backdrop, frames, soles)
+        sights = _sights(moving, backdrop, depths[others], background[others], foot, given[others])
+        depths[others] = shared_depths(moving, sights, focal_length)
     return depths
 
 
 def _seed(
     split: Split,
-    cameras: _Cameras,
+    cameras: Cameras,
     weights: Float[np.ndarray, "F K"],
     track: Tracks,
     depth: Float[np.ndarray, " O"],
@@ -113,7 +123,7 @@ def _seed(
     """The seed of one track, whose middle observation becomes the canonical centre."""
     frames, instants = track.frames, np.unique(cameras.time)
     times = cameras.time[frames]
-    positions, middle = _unprojected(track, cameras, depth), len(frames) // 2
+    positions, middle = unprojected(cameras, frames, track.pixels, depth), len(frames) // 2
     # The lifetime extends halfway to the neighbouring instants, at which the track is not seen, and to the end of time
     # where no frame says so.
     limits = np.concatenate([[0.0], (instants[:-1] + instants[1:]) / 2, [1.0]])
@@ -135,32 +145,22 @@ def _fitted_path(weights: Float[np.ndarray, "O K"], places: Float[np.ndarray, "O
     return np.linalg.solve(normal, weights.T @ places)
 
 
-def _sights(
-    tracks: Tracks,
-    split: Split,
-    cameras: _Cameras,
-    ground: Ground | None,
-    hidden: Float32[np.ndarray, " O"],
-    given: Float[np.ndarray, " O"],
-) -> Sights:
-    """What frames, cameras, ground and depths tell about the observations.
+def _sights(tracks: Tracks, backdrop: Backdrop, *known: Shaped[np.ndarray, " O"]) -> Sights:
+    """What cameras and scene tell about the observations, of which the last fields of `Sights` are known.
 
     Where cameras look too steeply, horizontal distances are treated as unknown.
     """
-    viewmat, K = cameras.viewmat[tracks.frames], cameras.K[tracks.frames]
-    horizontal, hidden = np.ones(len(hidden)), hidden.astype(np.float64)
-    if ground is not None:
-        hidden = with_ground(hidden, ground_depths(tracks.pixels, viewmat, K, ground))
-        per_depth = horizontal_per_depth(tracks.pixels, viewmat, K, ground.up)
+    cameras, frames = backdrop.cameras, tracks.frames
+    viewmat, K, horizontal = cameras.viewmat[frames], cameras.K[frames], np.ones(len(frames))
+    if backdrop.ground is not None:
+        per_depth = horizontal_per_depth(tracks.pixels, viewmat, K, backdrop.ground.up)
         horizontal = per_depth if per_depth.min() > MIN_HORIZONTAL else horizontal
-    surfaces = _unprojected(tracks, cameras, hidden)
-    background = looks_like_background(tracks, split, surfaces, cameras.viewmat, cameras.K)
-    times, rays = cameras.time[tracks.frames], pixel_rays(tracks.pixels, viewmat, K)
-    return Sights(times, camera_centres(viewmat), rays, horizontal, hidden, given, background)
+    rays = pixel_rays(tracks.pixels, viewmat, K)
+    return Sights(cameras.time[frames], camera_centres(viewmat), rays, horizontal, *known)
 
 
 def _given_depths(
-    tracks: Tracks, cameras: _Cameras, points: Float[np.ndarray, "P 3"], split: Split
+    tracks: Tracks, cameras: Cameras, points: Float[np.ndarray, "P 3"], split: Split
 ) -> Float[np.ndarray, " O"]:
     """The scene's own depth at the observations, world units; NaN where it has none."""
     columns, rows = tracks.pixels.astype(int).T
@@ -171,9 +171,3 @@ def _given_depths(
             depth = in_world_units(split.depths[frame], points, cameras.viewmat[frame], cameras.K[frame])
             depths[here] = depth[rows[here], columns[here]]
     return depths
-
-
-def _unprojected(tracks: Tracks, cameras: _Cameras, depth: Float[np.ndarray, " O"]) -> Float[np.ndarray, "O 3"]:
-    """World points of observations at those depths."""
-    viewmat, K = cameras.viewmat[tracks.frames], cameras.K[tracks.frames]
-    return camera_centres(viewmat) + depth[:, None] * pixel_rays(tracks.pixels, viewmat, K)

@@ -10,13 +10,13 @@ from jaxtyping import Bool, Float, Float32, Int, Shaped, UInt8
 from l2dgs_jax.cameras.epipolar import epipolar_geometry, project
 from l2dgs_jax.cameras.flow import brightened, pixel_indices
 from l2dgs_jax.data.dataset import Split
+from l2dgs_jax.training.backdrop import DEPTH_CELL
 from l2dgs_jax.training.flows import Flows
 
 SPACING = 3  # side in pixels of the cells that hold one track each, where tracks begin and where they meet
 MIN_DEVIATION = 1.0  # pixels by which flow must differ from that of a static scene at any depth
 WINDOW = 5  # side in pixels of the window over which frames are compared
 CLOSING = 7  # side in pixels of the morphological closing that fills holes in masks of moving pixels
-DEPTH_CELL = 4  # side in pixels of a square that has one depth
 UPDATE_WEIGHT = 0.3  # of the last step in the moving average of how far a track deviates from a static scene
 
 
@@ -39,6 +39,12 @@ class Tracks(NamedTuple):
 def by_track(tracks: Tracks, values: Shaped[np.ndarray, "O ..."]) -> list[Shaped[np.ndarray, "_ ..."]]:
     """Values of all observations, track by track; there is at least one."""
     return np.split(values, np.flatnonzero(np.diff(tracks.numbers)) + 1)
+
+
+def by_frame(tracks: Tracks) -> list[Int[np.ndarray, " N"]]:
+    """The observations of each frame that has any."""
+    order = np.argsort(tracks.frames, kind="stable")
+    return np.split(order, np.flatnonzero(np.diff(tracks.frames[order])) + 1)
 
 
 def share_in_track(tracks: Tracks, which: Bool[np.ndarray, " O"]) -> Float[np.ndarray, " O"]:

@@ -8,6 +8,7 @@ import pytest
 from l2dgs_jax.data.color import linear_to_srgb
 from l2dgs_jax.data.dataset import Split
 from l2dgs_jax.training import background
+from l2dgs_jax.training.backdrop import DEPTH_CELL, Backdrop, Cameras, Depths
 from l2dgs_jax.training.background import looks_like_background
 from l2dgs_jax.training.tracks import Tracks, share_in_track
 from l2dgs_jax.types import Camera
@@ -44,21 +45,21 @@ def seen(squares=(COLOUR, 0.6, 1.5)):
     return split, tracks
 
 
-def surfaces(tracks):
-    """Points of the wall behind the observations."""
-    centred = (tracks.pixels - SIDE / 2) / SIDE
-    return DEPTH * np.concatenate([centred, np.ones((len(centred), 1))], axis=-1)
+def backdrop(split, depth=DEPTH):
+    """The wall behind everything."""
+    cells = np.full((len(split.names), SIDE // DEPTH_CELL, SIDE // DEPTH_CELL), depth, np.float32)
+    return Backdrop(Cameras(*(np.asarray(x, float) for x in split.cameras)), Depths(cells[None], cells), None)
 
 
-def found(split, tracks, points):
+def found(split, tracks, behind=None):
     """Shares of the observations that look like the background."""
-    looks = looks_like_background(tracks, split, points, *(np.asarray(x, float) for x in split.cameras[:2]))
+    looks = looks_like_background(tracks.frames, tracks.pixels, split, behind or backdrop(split), tracks)
     return dict(zip(ROWS, share_in_track(tracks, looks)[:: len(looks) // 3].tolist(), strict=True))
 
 
 def test_a_shadow_shows_the_background_but_not_an_object_nor_a_light():
     split, tracks = seen()
-    shares = found(split, tracks, surfaces(tracks))
+    shares = found(split, tracks)
     assert shares["shadow"] > 0.95
     assert shares["object"] < 0.1
     assert shares["bright"] == 0
@@ -68,25 +69,33 @@ def test_noise_is_no_colour():
     split, tracks = seen((0.1, 0.9, 1.0))
     noise = np.random.default_rng(1).normal(0, 0.02, split.images.shape).astype(np.float32)
     split = dataclasses.replace(split, images=np.clip(split.images + noise, 0, 1))
-    shares = found(split, tracks, surfaces(tracks))
+    shares = found(split, tracks)
     assert min(shares["shadow"], shares["bright"]) > 0.8
     assert shares["object"] < 0.2
 
 
-@pytest.mark.parametrize("moved", [np.nan, 100.0])
-def test_a_surface_that_is_unknown_or_never_seen_elsewhere_is_not_shown(moved):
+def test_a_surface_of_unknown_depth_is_not_shown():
     split, tracks = seen()
-    points = surfaces(tracks)
-    points[tracks.numbers == 1] += moved
-    shares = found(split, tracks, points)
-    assert shares["shadow"] == 0
+    assert found(split, tracks, backdrop(split, np.nan))["shadow"] == 0
+
+
+def test_a_surface_that_is_never_seen_elsewhere_is_not_shown(monkeypatch):
+    monkeypatch.setattr(background, "REACH", 2 * SIDE)
+    assert found(*seen())["shadow"] == 0
+
+
+def test_other_pixels_than_those_of_tracks_can_be_asked_about():
+    split, tracks = seen()
+    pixels = np.array([[10.5, ROWS["object"] + 0.5], [60.5, ROWS["object"] + 0.5]])
+    looks = looks_like_background(np.zeros(2, int), pixels, split, backdrop(split), tracks)
+    assert looks.tolist() == [False, True]
 
 
 def test_pixels_that_are_not_valid_do_not_tell():
     split, tracks = seen()
     valid = np.ones(split.images.shape[:3], bool)
     valid[:-2] = False
-    shares = found(dataclasses.replace(split, valid=valid), tracks, surfaces(tracks))
+    shares = found(dataclasses.replace(split, valid=valid), tracks)
     assert shares["shadow"] == 0
 
 
@@ -94,4 +103,4 @@ def test_pixels_that_are_not_valid_do_not_tell():
 def test_a_few_frames_tell_what_the_background_looks_like(frames, monkeypatch):
     monkeypatch.setattr(background, "MAX_FRAMES", frames)
     split, tracks = seen()
-    assert found(split, tracks, surfaces(tracks))["shadow"] > 0.95
+    assert found(split, tracks)["shadow"] > 0.95

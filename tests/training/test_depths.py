@@ -1,12 +1,14 @@
-"""Depths of tracks, estimated from the points around them and shared by neighbours that move alike."""
+"""Depths of tracks, estimated from what they hide and shared by neighbours that move alike."""
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
 from l2dgs_jax.cameras.geometry import pixel_rays
-from l2dgs_jax.training.depths import Sights, depths_around, depths_at, shared_depths, with_ground
-from l2dgs_jax.training.tracks import DEPTH_CELL, Tracks, by_track
+from l2dgs_jax.training.backdrop import DEPTH_CELL, depths_at
+from l2dgs_jax.training.depths import Sights, shared_depths
+from l2dgs_jax.training.feet import find_feet
+from l2dgs_jax.training.tracks import Tracks, by_track
 
 HEIGHT, WIDTH, FRAMES = 24, 32, 8
 K = np.array([[30.0, 0, WIDTH / 2], [0, 30.0, HEIGHT / 2], [0, 0, 1]])
@@ -22,38 +24,21 @@ def cells(value=2.0):
     return np.full((FRAMES, HEIGHT // DEPTH_CELL, WIDTH // DEPTH_CELL), value, np.float32)
 
 
-def solved(tracks, hidden, factors=1.0, ground=np.nan, given=np.nan, focal_length=200.0, height=1000, background=None):
-    """Depths of tracks seen by a resting camera.
+def solved(tracks, hidden, factors=1.0, given=np.nan, focal_length=200.0, height=1000, background=None, reach=0.0):
+    """Depths of tracks seen by a resting camera; feet end `reach` pixels below their tracks.
 
     Depths and factors are the same for all, or have a row for each track or a column for each frame.
     """
     merged = Tracks(*(np.concatenate(parts) for parts in zip(*tracks, strict=True)))
-    factors, ground, given = (np.broadcast_to(x, (len(tracks), FRAMES)).ravel() for x in (factors, ground, given))
+    factors, given = (np.broadcast_to(x, (len(tracks), FRAMES)).ravel() for x in (factors, given))
     count = len(merged.frames)
     rays = pixel_rays(merged.pixels, np.broadcast_to(np.eye(4), (count, 4, 4)), np.broadcast_to(K, (count, 3, 3)))
     times, centres = merged.frames / FRAMES, np.zeros((count, 3))
-    behind = with_ground(depths_at(merged, hidden).astype(float), ground)
+    at = lambda pixels: depths_at(hidden, merged.frames, pixels).astype(float)
     background = np.zeros(count, bool) if background is None else background.ravel()
-    sights = Sights(times, centres, rays, factors, behind, given, background)
-    return by_track(merged, shared_depths(merged, sights, focal_length, height))
-
-
-def test_depths_around_are_ordered_and_lie_within_those_of_the_points():
-    rng = np.random.default_rng(0)
-    points = np.concatenate([rng.uniform(-3, 3, (4000, 2)), rng.uniform(2, 6, (4000, 1))], axis=-1)
-    still, hidden = depths_around(points, np.eye(4), K, HEIGHT, WIDTH)
-    assert still.shape[1:] == hidden.shape == (HEIGHT // DEPTH_CELL, WIDTH // DEPTH_CELL)
-    assert (np.diff(still, axis=0) > 0).all()
-    assert (still[0] < hidden).all()
-    assert (hidden < still[-1]).all()
-    assert still.min() >= 2
-    assert still.max() <= 6
-
-
-def test_without_points_in_view_depths_are_unknown():
-    still, hidden = depths_around(np.array([[0, 0, -1.0]]), np.eye(4), K, HEIGHT, WIDTH)
-    assert np.isnan(still).all()
-    assert np.isnan(hidden).all()
+    foot = np.where(find_feet(merged, ~background, height), at(merged.pixels + np.array([0, reach])), np.nan)
+    sights = Sights(times, centres, rays, factors, at(merged.pixels), background, foot, given)
+    return by_track(merged, shared_depths(merged, sights, focal_length))
 
 
 def test_a_depth_on_which_all_agree_is_kept():
@@ -62,13 +47,12 @@ def test_a_depth_on_which_all_agree_is_kept():
         assert_allclose(depth, 2, rtol=1e-3)
 
 
-def test_neighbours_share_a_depth_if_they_move_alike():
-    first = track(0, (4.5, 2.5), (1, 0))
-    depths = cells()
-    depths[:, 1:] = 4.0  # depth of the points around the second track
+def test_neighbours_share_a_distance_if_they_move_alike():
+    first = track(0, (4.5, 4.5), (1, 0))
+    factors = np.array([[1.0], [2.0]])
     difference = {}
     for velocity in (1.0, -1.0):
-        near, far = solved([first, track(1, (8.5, 6.5), (velocity, 0))], depths)
+        near, far = factors * solved([first, track(1, (10.5, 4.5), (velocity, 0))], cells(), factors)
         difference[velocity] = np.mean(far - near)
     assert difference[1.0] < 0.1
     assert difference[-1.0] > 1.5
@@ -79,7 +63,7 @@ def test_an_object_is_as_near_as_the_nearest_surface_that_it_hides():
     depths[:, 3:] = 2.0  # the ground that the lowest part stands on
     alike = [track(i, (4.5, 1.5 + 4 * i), (1, 0)) for i in range(5)]
     assert_allclose(solved(alike, depths), 2, rtol=1e-3)
-    apart = [track(i, (15.5, 1.5 + 4 * i), (i - 2, 0)) for i in range(5)]
+    apart = [track(0, (15.5, 9.5), (-2, 0)), track(1, (20.5, 13.5), (0, 0))]
     assert solved(apart, depths)[0].min() > 3.5
 
 
@@ -88,14 +72,16 @@ def test_an_object_is_as_near_as_the_nearest_surface_that_it_hides():
 def test_what_belongs_together_does_not_depend_on_the_size_of_the_picture(scale, difference, together):
     side, middle = 160 * scale, 80 * scale
     depths = np.full((FRAMES, side // DEPTH_CELL, side // DEPTH_CELL), 4.0, np.float32)
-    depths[:, middle // DEPTH_CELL + 4 :] = 2.0  # the ground that the lower half stands on
-    heights = np.arange(middle - 20 * scale, middle + 20 * scale, 4) + 2.0
-    faster = np.where(heights < middle, difference * scale, 0)
+    depths[:, :, middle // DEPTH_CELL :] = 2.0  # what the right half hides
+    columns = np.arange(middle - 20 * scale, middle + 20 * scale, 5) + 0.5
+    faster = np.where(columns < middle, difference * scale, 0)
     tracks = [
-        track(i, (middle - faster[i] * (FRAMES - 1) / 2, y), (faster[i] + scale, 0)) for i, y in enumerate(heights)
+        track(i, (x, middle - faster[i] * (FRAMES - 1) / 2), (0, faster[i] + scale)) for i, x in enumerate(columns)
     ]
-    upper = np.stack(solved(tracks, depths, focal_length=200.0 * scale))[heights < middle - 8]
-    assert upper.max() < 2.1 if together else upper.min() > 3.5
+    beside = (columns > middle - 5 * scale - 0.1) & (columns < middle)
+    found = np.stack(solved(tracks, depths, focal_length=200.0 * scale))[beside]
+    passing = found[:, FRAMES // 2 - 1 : FRAMES // 2 + 1]
+    assert passing.max() < 3 if together else passing.min() > 3.5
 
 
 def test_an_upright_object_has_one_horizontal_distance():
@@ -113,12 +99,6 @@ def test_what_an_object_hides_in_distant_columns_does_not_count():
     assert found[-1].max() < 3 < found[0].min()
 
 
-def test_an_object_on_the_ground_is_as_far_away_as_its_plane_not_as_the_points_around():
-    body = [track(i, (4.5, 4.5 + 4 * i), (1, 0)) for i in range(3)]
-    (*_, foot) = solved(body, cells(2.2), ground=np.array([[np.inf], [4.0], [2.0]]))
-    assert_allclose(foot, 2, rtol=1e-3)
-
-
 def test_what_an_object_hides_above_its_foot_does_not_count():
     depths = cells(2.0)
     depths[:, 2] = 1.5  # a few points of something else
@@ -127,16 +107,23 @@ def test_what_an_object_hides_above_its_foot_does_not_count():
     assert np.max(solved(body[:3], depths)) < 1.6
 
 
-def test_an_object_above_another_has_its_foot_behind_it_and_may_be_nearer_than_what_it_hides():
+def test_an_object_above_another_that_moves_otherwise_rests_on_it():
     depths = cells(4.0)
     depths[:, 4:] = 2.0
     upper, lower = (
         [track(i, (8.5, 1.5 + 4 * i), (v, 0)) for i in rows] for rows, v in ((range(4), 1), (range(4, 6), 0.2))
     )
-    alone, above = solved(upper, depths), solved([*upper, *lower], depths)
-    assert_allclose(alone, 4, rtol=1e-3)  # all of the ground below it is in view
-    assert np.max(above[:4]) < 3.7
-    assert_allclose(above[4:], 2, rtol=0.1)
+    assert_allclose(solved(upper, depths), 4, rtol=1e-3)  # all of the ground below it is in view
+    assert_allclose(solved([*upper, *lower], depths), 2, rtol=0.1)
+
+
+def test_an_object_above_several_rests_on_the_farthest():
+    depths = cells(4.0)
+    depths[:, 3:] = 3.0
+    depths[:, 4:] = 2.0
+    upper = [track(i, (8.5 + 3 * i, 8.5), (0, 0.02)) for i in range(2)]
+    legs = [track(2, (6.5, 14.5), (-0.8, 0)), track(3, (13.5, 17.5), (0.8, 0))]
+    assert_allclose(np.array(solved([*upper, *legs], depths))[:2, 0], 3, rtol=0.1)
 
 
 def test_a_shadow_below_an_object_is_not_its_foot():
@@ -147,6 +134,14 @@ def test_a_shadow_below_an_object_is_not_its_foot():
     shadow = np.repeat(np.arange(5) == 4, FRAMES)
     assert_allclose(solved(rows, depths), 2, rtol=1e-3)
     assert_allclose(solved(rows, depths, background=shadow), 3, rtol=1e-3)
+
+
+def test_the_end_of_a_foot_tells_where_it_stands():
+    depths = cells(4.0)
+    depths[:, 4:] = 2.0
+    body = [track(i, (8.5, 1.5 + 4 * i), (1, 0)) for i in range(3)]
+    assert_allclose(solved(body, depths), 4, rtol=1e-3)
+    assert_allclose(solved(body, depths, reach=7.0), 2, rtol=1e-3)
 
 
 def test_an_object_at_the_lower_border_may_be_nearer_than_what_it_hides():
@@ -160,7 +155,8 @@ def test_an_object_at_the_lower_border_may_be_nearer_than_what_it_hides():
 def test_things_that_move_alike_for_a_while_are_not_one_object():
     depths = cells(4.0)
     depths[:, 4:] = 2.0
-    upper, lower = ([track(i, (8.5, 1.5 + 4 * i), (1, 0)) for i in rows] for rows in (range(4), range(4, 6)))
+    upper = [track(i, (4.5, 1.5 + 4 * i), (1, 0)) for i in range(4)]
+    lower = [track(i, (10.5, 1.5 + 4 * i), (1, 0)) for i in range(4, 6)]
     assert_allclose(solved([*upper, *lower], depths), 2, rtol=1e-3)
     turning = np.where(np.arange(FRAMES) < FRAMES // 2, 0, 3 * (np.arange(FRAMES) - FRAMES // 2))[:, None] * (1, 0)
     parting = [part._replace(pixels=part.pixels + turning) for part in lower]
@@ -210,8 +206,8 @@ def shaken(amount, guess, factor=1.0, unit=1.0):
     track = Tracks(np.zeros(frames, int), np.arange(frames), 30.0 * rays[:, :2] + 50, np.ones(frames, bool))
     unknown, hidden = np.full(frames, np.nan), np.full(frames, guess * unit)
     factors, none = np.full(frames, factor), np.zeros(frames, bool)
-    sights = Sights(track.frames / frames, centres * unit, rays, factors, hidden, unknown, none)
-    return shared_depths(track, sights, 200.0, 1000) / (2.0 * unit)
+    sights = Sights(track.frames / frames, centres * unit, rays, factors, hidden, none, hidden, unknown)
+    return shared_depths(track, sights, 200.0) / (2.0 * unit)
 
 
 @pytest.mark.parametrize("guess", [1.0, 4.0])
