@@ -1,17 +1,18 @@
-"""Path-trace a scene whose truth is known: `python -m experiments.makers.make_walk OUTPUT [--frames N]`.
+"""Path-trace a scene whose truth is known: `python -m experiments.makers.make_walk OUTPUT [--scene NAME] [--frames N]`.
 
-Somebody walks through a yard in which a ball rolls, before a hand-held camera; a second camera, beside it, is held out.
-The scene has the layout of Nerfies, with masks of what moves and points on static surfaces, as structure from motion
-finds them. It is well lit: `python -m l2dgs_jax.simulate` makes it dark.
+Before a hand-held camera in a yard, somebody walks past while a ball rolls ("walk"), somebody comes nearer while a bag
+swings on a rope ("approach"), or two people meet behind a ball that bounces ("crowd"); a second camera, beside the
+first, is held out. The scene has the layout of Nerfies, with masks of what moves and points on static surfaces, as
+structure from motion finds them. It is well lit: `python -m l2dgs_jax.simulate` makes it dark.
 
 Needs Mitsuba 3 (`pip install mitsuba`). `--variant llvm_ad_rgb` takes half the time, and LLVM 17 or newer.
 """
 
 import argparse
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import mitsuba as mi
@@ -31,7 +32,7 @@ BASELINE = 0.5  # metres between the two cameras
 EVERY = 3  # the held-out camera sees every third instant
 POINTS, POINT_NOISE = 4000, 0.003  # the noise is a fraction of the distance
 
-START, END, LANE = -1.5, 1.3, 0.3  # the walk leads along x, at this y
+WAY = 2.8  # metres that a walk is long
 STRIDE = 1.3  # metres that a step of both legs covers
 LEG, LEG_RADIUS = (0.43, 0.42), 0.075  # lengths from hip to knee and to ankle
 SIDES = {-1: "left", 1: "right"}
@@ -50,39 +51,53 @@ Mask = Bool[np.ndarray, "H W"]
 Parts = dict[str, dict[str, Any]]
 
 
+class Scene(NamedTuple):
+    """What a camera films; all depends on the time, from 0 to 1.
+
+    Attributes:
+        film: position and axes, in rows, of the camera, or of one so many metres to its right that sees the same.
+        move: what moves.
+    """
+
+    film: Callable[[float, float], tuple[Vector, Float64[np.ndarray, "3 3"]]]
+    move: Callable[[float], Parts]
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("output", type=Path)
+    parser.add_argument("--scene", default="walk", choices=SCENES)
     parser.add_argument("--frames", type=int, default=48)
     parser.add_argument("--variant", default="scalar_rgb", choices=mi.variants())
     options = parser.parse_args()
     mi.set_variant(options.variant)
     with new_folder(options.output) as folder:  # which refuses before it takes minutes, not after
-        nerfies.write(make(options.frames), folder)
+        nerfies.write(make(options.scene, options.frames), folder)
 
 
-def make(frames: int) -> Dataset:
-    """The scene, well lit."""
+def make(name: str, frames: int) -> Dataset:
+    """The scene of that name, well lit."""
+    film, move = SCENES[name]
     rng = np.random.default_rng(0)
     points = []
     views: dict[float, list[tuple[str, Camera, Image, Mask]]] = {0.0: [], BASELINE: []}  # by the camera's offset
     static = yard()
     for i, time in enumerate(tqdm(np.linspace(0, 1, frames))):
-        scenes = [mi.load_dict({"type": "scene"} | parts) for parts in (static, static | walker(time) | ball(time))]
+        scenes = [mi.load_dict({"type": "scene"} | parts) for parts in (static, static | move(time))]
         for offset, seen in views.items():
             if offset and i % EVERY:
                 continue
-            position, rotation = camera(time, offset)
+            position, rotation = film(time, offset)
             image = render(scenes[1], position, rotation, {"type": "path", "max_depth": 6}, SAMPLES)
             image = linear_to_srgb(np.clip(image, 0, 1))
             behind, hits = (render(x, position, rotation, {"type": "aov", "aovs": "p:position"}, 1) for x in scenes)
             moves = (behind != hits).any(-1)
-            name = f"{i:06d}_r" if offset else f"{i:06d}"
-            seen.append((name, pinhole(position, rotation, time), image, moves))
+            frame = f"{i:06d}_r" if offset else f"{i:06d}"
+            seen.append((frame, pinhole(position, rotation, time), image, moves))
             if not offset:
                 points.append(corners(image, hits, moves, position, -(-POINTS // frames), rng))
     train, test = (_split(*zip(*seen, strict=True)) for seen in views.values())
-    return Dataset("walk", WIDTH, HEIGHT, train, test, np.concatenate(points).astype(np.float32))
+    return Dataset(name, WIDTH, HEIGHT, train, test, np.concatenate(points).astype(np.float32))
 
 
 def _split(
@@ -92,11 +107,55 @@ def _split(
     return Split(names, stacked, np.stack(images), masks=np.stack(masks))
 
 
-def camera(time: float, offset: float) -> tuple[Vector, Float64[np.ndarray, "3 3"]]:
-    """Position and axes, in rows, of the filming camera, or of one `offset` metres to its right that sees the same."""
+def walk(time: float) -> Parts:
+    """Somebody walks past, and a ball rolls in front."""
+    way, heading = 2.0 * time, np.array([np.cos(0.15), -np.sin(0.15), 0.0])
+    center = np.array([-0.8, -0.2, BALL]) + way * heading
+    turn = mi.ScalarTransform4f().rotate(np.cross([0.0, 0.0, 1.0], heading), np.degrees(way / BALL))
+    return walker(time, (-1.5, 0.3), (1, 0)) | {"ball": ball(center, turn)}
+
+
+def approach(time: float) -> Parts:
+    """Somebody comes nearer, and a bag swings on a rope."""
+    angle = 0.5 * np.sin(2 * np.pi * (1.3 * time + 0.1))
+    top = np.array([-1.0, 0.4, 2.6])
+    bag = top + 1.7 * np.array([np.sin(angle), 0.3 * np.sin(angle), -np.cos(angle)])
+    cloth = paint(31, [0.1, 0.25, 0.1], [0.8, 0.8, 0.3], (4, 4))
+    return walker(time, (1.2, 1.7), (-0.55, -0.83)) | {
+        "rope": {"type": "cylinder", "p0": top, "p1": bag, "radius": 0.02, "bsdf": cloth},
+        "bag": {"type": "sphere", "center": bag, "radius": 0.2, "bsdf": cloth},
+    }
+
+
+def crowd(time: float) -> Parts:
+    """Two people walk past each other, and a ball bounces in front."""
+    center = np.array([1.2 - 1.9 * time, -1.2, BALL + 0.5 * abs(np.sin(3 * np.pi * time))])
+    near, far = walker(time, (-1.5, -0.4), (1, 0.05)), walker(0.8 * time + 0.05, (1.9, 1.0), (-1, -0.1))
+    people = {f"near{k}": part for k, part in near.items()} | {f"far{k}": part for k, part in far.items()}
+    return people | {"ball": ball(center, mi.ScalarTransform4f())}
+
+
+def sideways(time: float, offset: float) -> tuple[Vector, Float64[np.ndarray, "3 3"]]:
     shake = 0.02 * np.array([np.sin(41 * time), np.sin(29 * time + 1), np.sin(53 * time + 2)])
-    position = np.array([-0.7 + 1.1 * time, -4.2 + 0.5 * np.sin(3 * time), 1.65]) + shake
-    target = np.array([0.3 * time, 0.6, 0.63]) + shake[::-1]
+    position = np.array([-0.7 + 1.1 * time, -4.2 + 0.5 * np.sin(3 * time), 1.65])
+    return _held(position, np.array([0.3 * time, 0.6, 0.63]), shake, offset)
+
+
+def forward(time: float, offset: float) -> tuple[Vector, Float64[np.ndarray, "3 3"]]:
+    shake = 0.02 * np.array([np.sin(37 * time + 0.3), np.sin(31 * time + 2), np.sin(47 * time)])
+    return _held(np.array([0.5 - 0.5 * time, -4.6 + 0.7 * time, 1.45]), np.array([-0.1, 0.6, 0.8]), shake, offset)
+
+
+def around(time: float, offset: float) -> tuple[Vector, Float64[np.ndarray, "3 3"]]:
+    shake = 0.015 * np.array([np.sin(43 * time), np.sin(27 * time + 1), np.sin(51 * time + 2)])
+    angle = 0.7 * time - 0.35
+    position = np.array([4.6 * np.sin(angle), 0.3 - 4.6 * np.cos(angle), 1.5])
+    return _held(position, np.array([0, 0.3, 0.75]), shake, offset)
+
+
+def _held(position: Vector, target: Vector, shake: Vector, offset: float) -> tuple[Vector, Float64[np.ndarray, "3 3"]]:
+    """A camera that shakes while it looks at a target, or another one to its right."""
+    position, target = position + shake, target + shake[::-1]
     position = position + offset * _axes(target - position)[0]
     return position, _axes(target - position)
 
@@ -208,27 +267,29 @@ def limb(name: str, joints: Sequence[Vector], radius: float, bsdf: dict[str, Any
     return parts
 
 
-def walker(time: float) -> Parts:
+def walker(time: float, start: tuple[float, float], heading: tuple[float, float]) -> Parts:
     """Somebody who swings arms and legs, one foot on the ground."""
     shirt = paint(20, [0.6, 0.1, 0.1], [0.85, 0.6, 0.3], (6, 6))
     trousers = paint(21, [0.05, 0.07, 0.2], [0.2, 0.25, 0.5], (4, 8))
     skin = paint(22, [0.6, 0.4, 0.3], [0.75, 0.55, 0.45], (3, 3))
     hair = paint(23, [0.1, 0.06, 0.03], [0.3, 0.2, 0.1])
-    x = START + (END - START) * time
-    phase = 2 * np.pi * (x - START) / STRIDE
+    phase = 2 * np.pi * WAY * time / STRIDE
+    ahead = np.array([*heading, 0.0]) / np.linalg.norm(heading)
+    aside = np.cross([0.0, 0.0, 1.0], ahead)
     legs = {}
     for side in SIDES:
         thigh = 0.45 * side * np.sin(phase)
         legs[side] = [thigh, thigh - 0.1 - 0.6 * max(0.0, side * np.cos(phase))]
-    hip = np.array([x, LANE, LEG_RADIUS + max(np.dot(LEG, np.cos(angles)) for angles in legs.values())])
+    height = LEG_RADIUS + max(np.dot(LEG, np.cos(angles)) for angles in legs.values())
+    hip = np.array([*start, height]) + WAY * time * ahead
 
     def body(x: float, y: float, z: float) -> Vector:
-        return hip + np.array([x, y, z])
+        return hip + x * ahead + y * aside + np.array([0.0, 0.0, z])
 
     def reach(start: Vector, lengths: Sequence[float], angles: Sequence[float]) -> list[Vector]:
         joints = [start]
         for length, angle in zip(lengths, angles, strict=True):
-            joints.append(joints[-1] + length * np.array([np.sin(angle), 0.0, -np.cos(angle)]))
+            joints.append(joints[-1] + length * (np.sin(angle) * ahead - np.array([0.0, 0.0, np.cos(angle)])))
         return joints
 
     parts = limb("trunk", [body(0, 0, 0.05), body(0.02, 0, 0.45)], 0.17, shirt)
@@ -240,15 +301,13 @@ def walker(time: float) -> Parts:
     return parts
 
 
-def ball(time: float) -> Parts:
-    """A ball that rolls past in front."""
-    way, heading = 2.0 * time, np.array([np.cos(0.15), -np.sin(0.15), 0.0])
-    center = np.array([-0.8, -0.2, BALL]) + way * heading
-    axis = np.cross([0.0, 0.0, 1.0], heading)
-    turned = mi.ScalarTransform4f().translate(center).rotate(axis, np.degrees(way / BALL)).scale(BALL)
-    return {
-        "ball": {"type": "sphere", "to_world": turned, "bsdf": paint(30, [0.1, 0.3, 0.7], [0.95, 0.9, 0.2], (4, 3))}
-    }
+def ball(center: Vector, turn: Any) -> dict[str, Any]:
+    colours = paint(30, [0.1, 0.3, 0.7], [0.95, 0.9, 0.2], (4, 3))
+    placed = mi.ScalarTransform4f().translate(center) @ turn @ mi.ScalarTransform4f().scale(BALL)
+    return {"type": "sphere", "to_world": placed, "bsdf": colours}
+
+
+SCENES = {"walk": Scene(sideways, walk), "approach": Scene(forward, approach), "crowd": Scene(around, crowd)}
 
 
 if __name__ == "__main__":
