@@ -48,7 +48,7 @@ def _presets() -> dict[str, Config]:
         inbetweens=0.3,
         model=ModelConfig(
             unit="depth",
-            scale_growth="linear",  # growing exponentially, a few Gaussians come to fill the image
+            scale_growth="bounded",  # otherwise a few static Gaussians grow to veils before the scene
             motion_gate=True,
             shut_gates=0.3,  # otherwise static parts keep moving a little, and the longer they train the more
             tracks=True,

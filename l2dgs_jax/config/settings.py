@@ -101,9 +101,9 @@ class ModelConfig:
     hidden: int = 128  # width of the aggregation g (Eq. 1), of the motion heads and of OCD-Net
     # whether a fourth motion head changes the opacity (before its sigmoid) over time, as 4DGS can (arXiv 2310.08528)
     opacity_head: bool = False
-    # factor by which an output x > 0 of the scale head enlarges a Gaussian: "exponential", exp(x), or "linear", 1 + x;
-    # x < 0 shrinks it by exp(x) either way
-    scale_growth: Literal["exponential", "linear"] = "exponential"
+    # factor by which an output x > 0 of the scale head enlarges a Gaussian: "exponential", exp(x), or "bounded",
+    # exp(0.2 tanh(x / 0.2)), at most 1.22; x < 0 shrinks it by exp(x) either way
+    scale_growth: Literal["exponential", "bounded"] = "exponential"
     # whether every Gaussian has a gate: a learned factor in (0, 1) on all that the motion field does to it
     motion_gate: bool = False
     shut_gates: float = 0.0  # a motion gate below this is shut for good: its Gaussian stands still

@@ -12,6 +12,7 @@ from l2dgs_jax.config import ModelConfig
 from l2dgs_jax.model import compaction, hexplane, networks, spherical_harmonics
 from l2dgs_jax.types import Camera, Gaussians, MovedGaussians, Scene
 
+MAX_GROWTH = 0.2  # bound of how much log-scales grow if their growth is bounded
 FADE_DURATION = 0.25  # time in which a Gaussian on a path fades in or out, in spacings of the path's control points
 
 
@@ -112,10 +113,10 @@ def openness(gate: Float[Array, " N"], cfg: ModelConfig) -> Float[Array, " N"]:
 
 
 def _growth(log_scales: Float[Array, "V N 3"], cfg: ModelConfig) -> Float[Array, "V N 3"]:
-    """What is added to the log-scales for their head's output x: x, or log(1 + x) if growth is linear and x > 0."""
+    """What is added to the log-scales for their head's output x: x, or less if growth is bounded and x > 0."""
     if cfg.scale_growth == "exponential":
         return log_scales
-    return jnp.log1p(jnp.maximum(log_scales, 0)) + jnp.minimum(log_scales, 0)
+    return MAX_GROWTH * jnp.tanh(jnp.maximum(log_scales, 0) / MAX_GROWTH) + jnp.minimum(log_scales, 0)
 
 
 def _on_paths(

@@ -11,7 +11,7 @@ from l2dgs_jax.training.tracks import Tracks, by_frame
 BELOW = 1.5, 9.0  # pixels from an observation down to another one that counts as just below it
 BESIDE = 4.5  # and to either side
 REACH = 0.15  # height in focal lengths up to which the lowest part of an object may show no motion
-STEP = 2.0  # pixels between places where the end of that part is looked for
+STEP = 2.0  # pixels between places at which its end is looked for
 
 
 def just_below(tracks: Tracks, foreground: Bool[np.ndarray, " O"]) -> Int[np.ndarray, "2 E"]:
@@ -60,5 +60,5 @@ def find_soles(
     within = places[..., 1] < height
     ends = np.zeros(within.shape, bool)
     ends[within] = is_background(np.repeat(frames, within.sum(-1)), places[within])
-    steps = np.where(ends.any(-1), ends.argmax(-1), 0)
-    return feet + np.stack([np.zeros(len(feet)), STEP * steps], axis=-1)
+    below = np.where(ends.any(-1), ends.argmax(-1) + 0.5, 0)  # the end lies halfway between two places
+    return feet + np.stack([np.zeros(len(feet)), STEP * below], axis=-1)

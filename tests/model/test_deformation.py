@@ -11,7 +11,7 @@ from jax.test_util import check_grads
 
 from l2dgs_jax.config import ModelConfig
 from l2dgs_jax.model import hexplane, networks
-from l2dgs_jax.model.deformation import deform, path_weights
+from l2dgs_jax.model.deformation import MAX_GROWTH, deform, path_weights
 from l2dgs_jax.types import Camera, Gaussians, Scene, SceneParams
 
 CFG = ModelConfig(
@@ -182,8 +182,8 @@ def test_fine_stage_adds_the_outputs_of_the_heads_to_the_raw_parameters():
         np.testing.assert_array_equal(getattr(moved, name), getattr(undeformed, name))
 
 
-def test_linear_growth_of_scales_is_1_plus_x_above_zero():
-    linear = dataclasses.replace(CFG, scale_growth="linear")
+def test_bounded_growth_of_scales_starts_like_exponential_growth_and_ends_at_its_bound():
+    bounded = dataclasses.replace(CFG, scale_growth="bounded")
     params, cameras = random_params(), views()
     scales, canonical = params.heads.scale, np.exp(np.asarray(params.gaussians.log_scales))[None]
     for size in (1.0, 100.0):
@@ -192,12 +192,12 @@ def test_linear_growth_of_scales_is_1_plus_x_above_zero():
         motion, _ = field_and_motion(params._replace(heads=heads), cameras.time, CFG)
         x = np.asarray(motion.log_scales)
         assert x.min() < 0 < x.max()
-        moved = deformed(params._replace(heads=heads), cfg=linear, cameras=cameras, moving=True)
-        expected = canonical * np.where(x > 0, 1 + x, np.exp(np.minimum(x, 0)))
+        moved = deformed(params._replace(heads=heads), cfg=bounded, cameras=cameras, moving=True)
+        expected = canonical * np.exp(np.where(x > 0, MAX_GROWTH * np.tanh(x / MAX_GROWTH), x))
         np.testing.assert_allclose(moved.scales, expected, rtol=1e-12)
     scaled = lambda head: (
         deformed(
-            params._replace(heads=params.heads._replace(scale=head)), cfg=linear, cameras=cameras, moving=True
+            params._replace(heads=params.heads._replace(scale=head)), cfg=bounded, cameras=cameras, moving=True
         ).scales
     )
     check_grads(scaled, (scales,), 1, ["rev"], eps=1e-6)
