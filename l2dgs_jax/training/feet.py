@@ -60,5 +60,5 @@ def find_soles(
     within = places[..., 1] < height
     ends = np.zeros(within.shape, bool)
     ends[within] = is_background(np.repeat(frames, within.sum(-1)), places[within])
-    below = np.where(ends.any(-1), ends.argmax(-1) + 0.5, 0)  # the end lies halfway between two places
-    return feet + np.stack([np.zeros(len(feet)), STEP * below], axis=-1)
+    steps = np.where(ends.any(-1), ends.argmax(-1), 0)
+    return feet + np.stack([np.zeros(len(feet)), STEP * steps], axis=-1)
