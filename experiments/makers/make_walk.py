@@ -49,17 +49,18 @@ Vector = Float64[np.ndarray, "3"]
 Image = Float64[np.ndarray, "H W 3"]
 Mask = Bool[np.ndarray, "H W"]
 Parts = dict[str, dict[str, Any]]
+Pose = tuple[Vector, Float64[np.ndarray, "3 3"]]  # position and axes, in rows, of a camera
 
 
 class Scene(NamedTuple):
     """What a camera films; all depends on the time, from 0 to 1.
 
     Attributes:
-        film: position and axes, in rows, of the camera, or of one so many metres to its right that sees the same.
+        film: the camera, or another one so many metres to its right that sees the same.
         move: what moves.
     """
 
-    film: Callable[[float, float], tuple[Vector, Float64[np.ndarray, "3 3"]]]
+    film: Callable[[float, float], Pose]
     move: Callable[[float], Parts]
 
 
@@ -135,25 +136,25 @@ def crowd(time: float) -> Parts:
     return people | {"ball": ball(center, mi.ScalarTransform4f())}
 
 
-def sideways(time: float, offset: float) -> tuple[Vector, Float64[np.ndarray, "3 3"]]:
+def sideways(time: float, offset: float) -> Pose:
     shake = 0.02 * np.array([np.sin(41 * time), np.sin(29 * time + 1), np.sin(53 * time + 2)])
     position = np.array([-0.7 + 1.1 * time, -4.2 + 0.5 * np.sin(3 * time), 1.65])
     return _held(position, np.array([0.3 * time, 0.6, 0.63]), shake, offset)
 
 
-def forward(time: float, offset: float) -> tuple[Vector, Float64[np.ndarray, "3 3"]]:
+def forward(time: float, offset: float) -> Pose:
     shake = 0.02 * np.array([np.sin(37 * time + 0.3), np.sin(31 * time + 2), np.sin(47 * time)])
     return _held(np.array([0.5 - 0.5 * time, -4.6 + 0.7 * time, 1.45]), np.array([-0.1, 0.6, 0.8]), shake, offset)
 
 
-def around(time: float, offset: float) -> tuple[Vector, Float64[np.ndarray, "3 3"]]:
+def around(time: float, offset: float) -> Pose:
     shake = 0.015 * np.array([np.sin(43 * time), np.sin(27 * time + 1), np.sin(51 * time + 2)])
     angle = 0.7 * time - 0.35
     position = np.array([4.6 * np.sin(angle), 0.3 - 4.6 * np.cos(angle), 1.5])
     return _held(position, np.array([0, 0.3, 0.75]), shake, offset)
 
 
-def _held(position: Vector, target: Vector, shake: Vector, offset: float) -> tuple[Vector, Float64[np.ndarray, "3 3"]]:
+def _held(position: Vector, target: Vector, shake: Vector, offset: float) -> Pose:
     """A camera that shakes while it looks at a target, or another one to its right."""
     position, target = position + shake, target + shake[::-1]
     position = position + offset * _axes(target - position)[0]

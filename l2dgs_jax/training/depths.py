@@ -11,7 +11,6 @@ from scipy.sparse.linalg import cg
 from scipy.spatial import cKDTree
 
 from l2dgs_jax.training import parallax
-from l2dgs_jax.training.feet import just_below
 from l2dgs_jax.training.tracks import Tracks, by_frame, by_track
 
 NEIGHBOUR_RADIUS = 9.0  # pixels within which tracks may belong to one object
@@ -42,7 +41,6 @@ class Sights(NamedTuple):
         rays: from there through the pixels, per unit of depth.
         horizontal: horizontal distance per unit of depth, positive; 1 for all if it is unknown where up is.
         hidden: depth of the surface that something there would hide, world units.
-        background: whether they look like that surface.
         foot: if they are feet of objects, depth of the ground that the ends of these hide, world units.
         given: depth that came with the scene, world units.
     """
@@ -52,12 +50,13 @@ class Sights(NamedTuple):
     rays: Float[np.ndarray, "O 3"]
     horizontal: Float[np.ndarray, " O"]
     hidden: Float[np.ndarray, " O"]
-    background: Bool[np.ndarray, " O"]
     foot: Float[np.ndarray, " O"]
     given: Float[np.ndarray, " O"]
 
 
-def shared_depths(tracks: Tracks, sights: Sights, focal_length: float) -> Float[np.ndarray, " O"]:
+def shared_depths(
+    tracks: Tracks, sights: Sights, below: Int[np.ndarray, "2 E"], focal_length: float
+) -> Float[np.ndarray, " O"]:
     """Depths of all observations of the tracks, solved for jointly, world units.
 
     Solved for are horizontal distances, because they are the same for all parts of an upright object. Most objects
@@ -70,12 +69,13 @@ def shared_depths(tracks: Tracks, sights: Sights, focal_length: float) -> Float[
     Args:
         tracks: at least one observation lies in a cell of known depth.
         sights: what cameras and scene tell about them.
+        below: pairs of observations of one frame, of which the second is just below the first.
         focal_length: of the cameras, pixels: how far apart and how fast things are is judged by angles.
     """
     pairs = _neighbours(tracks)
     similarity = _similarity(pairs, tracks, max(MIN_VELOCITY_SIGMA, VELOCITY_SIGMA * focal_length))
     width = max(MIN_COLUMNS, COLUMNS * focal_length)
-    guess = _first_guess(tracks, sights, pairs[:, similarity > ALIKE], width)
+    guess = _first_guess(tracks, sights, below, pairs[:, similarity > ALIKE], width)
     smoothness = _smoothness(tracks, pairs, similarity)
     rays = sights.rays / sights.horizontal[:, None]
     windows = parallax.find_windows(tracks.numbers, sights.times, sights.centres, rays)
@@ -107,18 +107,21 @@ class _Guess(NamedTuple):
     floats: Bool[np.ndarray, " O"]
 
 
-def _first_guess(tracks: Tracks, sights: Sights, alike: Int[np.ndarray, "2 E"], width: float) -> _Guess:
+def _first_guess(
+    tracks: Tracks, sights: Sights, below: Int[np.ndarray, "2 B"], alike: Int[np.ndarray, "2 E"], width: float
+) -> _Guess:
     """Given distances, or the nearest that the feet of objects or, where there are none, all of their parts hide.
 
     Args:
         tracks: their observations.
         sights: what is known about them.
+        below: pairs of observations, of which the second is just below the first.
         alike: pairs of observations that move alike.
         width: of the columns in which objects hide what counts, to either side.
     """
     hidden, foot, given = (sights.horizontal * x for x in (sights.hidden, sights.foot, sights.given))
     stands = _nearest(tracks, foot, alike, width)
-    rests = _resting(tracks, just_below(tracks, ~sights.background), np.where(np.isnan(foot), np.nan, stands))
+    rests = _resting(tracks, below, np.where(np.isnan(foot), np.nan, stands))
     stands = np.where(np.isnan(stands), rests, stands)
     guess = np.where(np.isnan(stands), _nearest(tracks, hidden, alike, width), stands)
     is_given = np.isfinite(given)

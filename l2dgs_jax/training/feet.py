@@ -28,10 +28,12 @@ def just_below(tracks: Tracks, foreground: Bool[np.ndarray, " O"]) -> Int[np.nda
     return np.concatenate(pairs, axis=1)
 
 
-def find_feet(tracks: Tracks, foreground: Bool[np.ndarray, " O"], height: int) -> Bool[np.ndarray, " O"]:
-    """Which foreground observations have none of these just below, and are not at the lower border of the frame."""
+def find_feet(
+    tracks: Tracks, foreground: Bool[np.ndarray, " O"], below: Int[np.ndarray, "2 E"], height: int
+) -> Bool[np.ndarray, " O"]:
+    """Which foreground observations have none of these just `below`, and are not at the lower border of the frame."""
     feet = foreground & (tracks.pixels[:, 1] + BELOW[1] < height)
-    feet[just_below(tracks, foreground)[0]] = False
+    feet[below[0]] = False
     return feet
 
 

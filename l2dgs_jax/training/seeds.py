@@ -26,7 +26,7 @@ from l2dgs_jax.training.backdrop import (
 )
 from l2dgs_jax.training.background import looks_like_background
 from l2dgs_jax.training.depths import Sights, shared_depths
-from l2dgs_jax.training.feet import find_feet, find_soles
+from l2dgs_jax.training.feet import find_feet, find_soles, just_below
 from l2dgs_jax.training.flows import neighbour_flows
 from l2dgs_jax.training.given_depth import in_world_units
 from l2dgs_jax.training.tracks import SPACING, Tracks, by_track, find_tracks, share_in_track
@@ -103,13 +103,15 @@ def _depths(
     if np.isfinite(depths[others]).any():
         moving = Tracks(*(x[others] for x in tracks))
         focal_length, height = float(backdrop.cameras.K[:, 0, 0].mean()), split.images.shape[1]
-        feet = find_feet(moving, ~background[others], height)
+        foreground = ~background[others]
+        below = just_below(moving, foreground)
+        feet = find_feet(moving, foreground, below, height)
         frames = moving.frames[feet]
         soles = find_soles(frames, moving.pixels[feet], is_background, focal_length, height)
         foot = np.full(len(feet), np.nan)
         foot[feet] = floor_depths(backdrop, frames, soles)
-        sights = _sights(moving, backdrop, depths[others], background[others], foot, given[others])
-        depths[others] = shared_depths(moving, sights, focal_length)
+        sights = _sights(moving, backdrop, depths[others], foot, given[others])
+        depths[others] = shared_depths(moving, sights, below, focal_length)
     return depths
 
 

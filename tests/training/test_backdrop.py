@@ -64,6 +64,12 @@ def test_things_do_not_stand_on_a_surface_that_is_not_the_ground():
     assert_allclose(hidden_depths(seen(1.0, LOW), FRAMES, PIXELS), 1)
 
 
+def test_there_is_no_ground_above_the_horizon():
+    above = PIXELS - np.array([0.0, 12.0])
+    assert np.isnan(floor_depths(seen(2.2, LOW), FRAMES, above)).all()
+    assert_allclose(hidden_depths(seen(2.2, LOW), FRAMES, above), 2.2, rtol=1e-6)
+
+
 def test_where_no_ground_is_known_things_may_stand_on_any_surface():
     assert_allclose(floor_depths(seen(1.7), FRAMES, PIXELS), 1.7, rtol=1e-6)
     assert_allclose(hidden_depths(seen(1.7), FRAMES, PIXELS), 1.7, rtol=1e-6)

@@ -7,7 +7,7 @@ from numpy.testing import assert_allclose
 from l2dgs_jax.cameras.geometry import pixel_rays
 from l2dgs_jax.training.backdrop import DEPTH_CELL, depths_at
 from l2dgs_jax.training.depths import Sights, shared_depths
-from l2dgs_jax.training.feet import find_feet
+from l2dgs_jax.training.feet import find_feet, just_below
 from l2dgs_jax.training.tracks import Tracks, by_track
 
 HEIGHT, WIDTH, FRAMES = 24, 32, 8
@@ -35,10 +35,12 @@ def solved(tracks, hidden, factors=1.0, given=np.nan, focal_length=200.0, height
     rays = pixel_rays(merged.pixels, np.broadcast_to(np.eye(4), (count, 4, 4)), np.broadcast_to(K, (count, 3, 3)))
     times, centres = merged.frames / FRAMES, np.zeros((count, 3))
     at = lambda pixels: depths_at(hidden, merged.frames, pixels).astype(float)
-    background = np.zeros(count, bool) if background is None else background.ravel()
-    foot = np.where(find_feet(merged, ~background, height), at(merged.pixels + np.array([0, reach])), np.nan)
-    sights = Sights(times, centres, rays, factors, at(merged.pixels), background, foot, given)
-    return by_track(merged, shared_depths(merged, sights, focal_length))
+    foreground = np.ones(count, bool) if background is None else ~background.ravel()
+    below = just_below(merged, foreground)
+    feet = find_feet(merged, foreground, below, height)
+    foot = np.where(feet, at(merged.pixels + np.array([0, reach])), np.nan)
+    sights = Sights(times, centres, rays, factors, at(merged.pixels), foot, given)
+    return by_track(merged, shared_depths(merged, sights, below, focal_length))
 
 
 def test_a_depth_on_which_all_agree_is_kept():
@@ -205,9 +207,8 @@ def shaken(amount, guess, factor=1.0, unit=1.0):
     rays = (path - centres) / 2
     track = Tracks(np.zeros(frames, int), np.arange(frames), 30.0 * rays[:, :2] + 50, np.ones(frames, bool))
     unknown, hidden = np.full(frames, np.nan), np.full(frames, guess * unit)
-    factors, none = np.full(frames, factor), np.zeros(frames, bool)
-    sights = Sights(track.frames / frames, centres * unit, rays, factors, hidden, none, hidden, unknown)
-    return shared_depths(track, sights, 200.0) / (2.0 * unit)
+    sights = Sights(track.frames / frames, centres * unit, rays, np.full(frames, factor), hidden, hidden, unknown)
+    return shared_depths(track, sights, np.empty((2, 0), int), 200.0) / (2.0 * unit)
 
 
 @pytest.mark.parametrize("guess", [1.0, 4.0])

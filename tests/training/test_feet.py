@@ -24,8 +24,9 @@ def test_what_is_just_below_is_near_in_both_directions():
     (low, high), x = BELOW, 50.0
     places = [(x, 50), (x, 50 + high - 0.1), (x + BESIDE - 0.1, 50 + low + 0.1), (x, 50 + low - 0.1)]
     tracks = observations([*places, (x + BESIDE + 0.1, 55), (x, 50 + high + 2)])
-    assert set(map(tuple, just_below(tracks, every(tracks)).T.tolist())) >= {(0, 1), (0, 2), (1, 5)}
-    assert not {(0, 3), (0, 4), (0, 5)} & set(map(tuple, just_below(tracks, every(tracks)).T.tolist()))
+    pairs = set(map(tuple, just_below(tracks, every(tracks)).T.tolist()))
+    assert pairs >= {(0, 1), (0, 2), (1, 5)}
+    assert not {(0, 3), (0, 4), (0, 5)} & pairs
 
 
 def test_things_of_other_frames_and_of_the_background_are_not_below():
@@ -35,15 +36,19 @@ def test_things_of_other_frames_and_of_the_background_are_not_below():
     assert just_below(tracks, np.zeros(3, bool)).shape == (2, 0)
 
 
+def feet_of(tracks, foreground, height=HEIGHT):
+    return find_feet(tracks, foreground, just_below(tracks, foreground), height).tolist()
+
+
 def test_feet_have_nothing_below_and_are_not_at_the_lower_border():
     column = observations([(50, 20), (50, 26), (50, 32), (80, 95)])
-    assert find_feet(column, every(column), HEIGHT).tolist() == [False, False, True, False]
-    assert find_feet(column, every(column), 200)[3]
+    assert feet_of(column, every(column)) == [False, False, True, False]
+    assert feet_of(column, every(column), 200)[3]
 
 
 def test_a_shadow_is_no_foot_and_what_stands_above_it_is_one():
     column = observations([(50, 20), (50, 26), (50, 32)])
-    assert find_feet(column, np.array([True, True, False]), HEIGHT).tolist() == [False, True, False]
+    assert feet_of(column, np.array([True, True, False])) == [False, True, False]
 
 
 @pytest.mark.parametrize("end", [52.0, 57.0, 68.0])
