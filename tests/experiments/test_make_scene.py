@@ -2,37 +2,39 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from experiments.makers import make_walk
+from experiments.makers import make_scene
 from l2dgs_jax.cameras.geometry import project_points
 from l2dgs_jax.data import load_dataset, nerfies
 
 FRAMES = 4
+SEEN = {"walk": "head0", "approach": "head0", "crowd": "nearhead0", "table": "hand0"}  # what nothing hides
 
 
-@pytest.fixture(scope="module", params=sorted(make_walk.SCENES))
+@pytest.fixture(scope="module", params=sorted(make_scene.SCENES))
 def dataset(request, tmp_path_factory):
     mi.set_variant("scalar_rgb")
     folder = tmp_path_factory.mktemp("made") / request.param
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(make_walk, "SAMPLES", 1)
-        nerfies.write(make_walk.make(request.param, FRAMES), folder)
+        patch.setattr(make_scene, "SAMPLES", 1)
+        nerfies.write(make_scene.make(request.param, FRAMES), folder)
     return load_dataset(str(folder))
 
 
 def test_the_scene_is_read_with_the_second_camera_held_out(dataset):
     assert dataset.train.names == ("000000", "000001", "000002", "000003")
     assert dataset.test.names == ("000000_r", "000003_r")
-    (first, _), (second, _) = (make_walk.SCENES[dataset.name].film(0.0, x) for x in (0.0, make_walk.BASELINE))
-    np.testing.assert_allclose(np.linalg.norm(second - first), make_walk.BASELINE)
+    scene = make_scene.SCENES[dataset.name]
+    (first, _), (second, _) = (scene.film(0.0, x) for x in (0.0, scene.baseline))
+    np.testing.assert_allclose(np.linalg.norm(second - first), scene.baseline)
 
 
 @pytest.mark.parametrize("split", ["train", "test"])
-def test_masks_show_the_walker_where_the_cameras_see_him(dataset, split):
+def test_masks_show_what_moves_where_the_cameras_see_it(dataset, split):
     split = getattr(dataset, split)
     for i, time in enumerate(split.cameras.time):
-        parts = make_walk.SCENES[dataset.name].move(float(time))
-        head = np.array(parts["nearhead0" if dataset.name == "crowd" else "head0"]["center"], np.float32)
-        pixels, _ = project_points(head[None], split.cameras.viewmat[i], split.cameras.K[i])
+        parts = make_scene.SCENES[dataset.name].move(float(time))
+        center = np.array(parts[SEEN[dataset.name]]["center"], np.float32)
+        pixels, _ = project_points(center[None], split.cameras.viewmat[i], split.cameras.K[i])
         column, row = np.floor(pixels[0]).astype(int)
         assert split.masks[i, row, column]
         assert split.masks[i].mean() < 0.2
@@ -45,6 +47,6 @@ def test_points_lie_on_what_stands_still(dataset):
         points = dataset.points[i * per_frame : (i + 1) * per_frame]
         pixels, depth = project_points(points, cameras.viewmat[i], cameras.K[i])
         column, row = np.floor(pixels).astype(int).T
-        assert (depth > 1).all()
+        assert (depth > 2 * make_scene.SCENES[dataset.name].baseline).all()
         assert not masks[i, row.clip(0, masks.shape[1] - 1), column.clip(0, masks.shape[2] - 1)].any()
     assert dataset.points[:, 2].min() > -0.1  # nothing is below the ground
