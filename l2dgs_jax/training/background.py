@@ -37,8 +37,37 @@ def looks_like_background(
         backdrop: of these.
         tracks: what seems to move there.
     """
+    _, alike = _compared(frames, pixels, split, backdrop, tracks, np.full(len(frames), -np.inf))
+    return alike
+
+
+def differs_from_background(
+    frames: Int[np.ndarray, " N"],
+    pixels: Float[np.ndarray, "N 2"],
+    split: Split,
+    backdrop: Backdrop,
+    tracks: Tracks,
+    since: Float[np.ndarray, " N"],
+) -> Bool[np.ndarray, " N"]:
+    """Which pixels of frames show other colours than the static surfaces behind them, as seen after the time `since`.
+
+    Where these are not seen, the answer is no. The other arguments are those of `looks_like_background`.
+    """
+    known, alike = _compared(frames, pixels, split, backdrop, tracks, since)
+    return known & ~alike
+
+
+def _compared(
+    frames: Int[np.ndarray, " N"],
+    pixels: Float[np.ndarray, "N 2"],
+    split: Split,
+    backdrop: Backdrop,
+    tracks: Tracks,
+    since: Float[np.ndarray, " N"],
+) -> tuple[Bool[np.ndarray, " N"], Bool[np.ndarray, " N"]]:
+    """Whether the surfaces behind are seen after some time, and whether pixels are known to look like them."""
     height, width = split.images.shape[1:3]
-    viewmats, Ks, _ = backdrop.cameras
+    viewmats, Ks, times = backdrop.cameras
     surfaces = unprojected(backdrop.cameras, frames, pixels, hidden_depths(backdrop, frames, pixels))
     chosen = np.unique(np.linspace(0, len(viewmats) - 1, MAX_FRAMES).round().astype(int)).tolist()
     elsewhere = np.full((len(chosen), len(surfaces), 3), np.nan, np.float32)
@@ -56,14 +85,15 @@ def looks_like_background(
             if split.valid is not None:
                 free &= split.valid[frame]
             places, depth = project_points(surfaces, viewmats[frame], Ks[frame])
-            seen = np.flatnonzero((depth > 0) & ((places >= 0) & (places < (width, height))).all(-1))  # never NaN
+            inside = ((places >= 0) & (places < (width, height))).all(-1)  # never NaN
+            seen = np.flatnonzero((depth > 0) & inside & (times[frame] > since))
             column, row = places[seen].astype(int).T
             at = free[row, column]
             elsewhere[chosen.index(frame), seen[at]] = light[row[at], column[at]]
-    known = np.isfinite(elsewhere[..., 0]).sum(0) >= MIN_SEEN
+    known, alike = np.isfinite(elsewhere[..., 0]).sum(0) >= MIN_SEEN, np.zeros(len(surfaces), bool)
     if known.any():
-        known[known] = _alike(here[known], np.nanmedian(elsewhere[:, known], axis=0))
-    return known
+        alike[known] = _alike(here[known], np.nanmedian(elsewhere[:, known], axis=0))
+    return known, alike
 
 
 def _alike(here: Float32[np.ndarray, "N 3"], elsewhere: Float32[np.ndarray, "N 3"]) -> Bool[np.ndarray, " N"]:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Shaped
 
-from l2dgs_jax.cameras.geometry import camera_centres, pixel_rays, project_points
+from l2dgs_jax.cameras.geometry import camera_centres, pixel_rays
 from l2dgs_jax.cameras.ground import horizontal_per_depth
 from l2dgs_jax.data.dataset import Split
 from l2dgs_jax.model.deformation import path_weights
@@ -18,7 +18,6 @@ from l2dgs_jax.model.initialisation import Seeds, path_knots, z_order
 from l2dgs_jax.training.backdrop import (
     Backdrop,
     Cameras,
-    depths_at,
     find_backdrop,
     floor_depths,
     hidden_depths,
@@ -27,13 +26,10 @@ from l2dgs_jax.training.backdrop import (
 from l2dgs_jax.training.background import looks_like_background
 from l2dgs_jax.training.depths import Sights, shared_depths
 from l2dgs_jax.training.feet import find_feet, find_soles, just_below
-from l2dgs_jax.training.flows import neighbour_flows
 from l2dgs_jax.training.given_depth import in_world_units
-from l2dgs_jax.training.tracks import SPACING, Tracks, by_track, find_tracks, share_in_track
+from l2dgs_jax.training.moving_tracks import moving_tracks
+from l2dgs_jax.training.tracks import SPACING, Tracks, by_track, share_in_track
 
-MIN_LENGTH = 3  # frames that a track must be seen in
-MIN_MOVING_SHARE = 0.4  # share of these frames in which it must be seen to move
-MIN_DEVIATION = 3.0  # pixels that a track must at some time be away from where a static point would appear
 MIN_HORIZONTAL = 0.2  # horizontal distance per unit of depth below which a camera looks down too steeply
 BACKGROUND_SHARE = 0.5  # share of a track's observations, from which on it is the background that the track shows
 STIFFNESS = 1e-3  # weight of squared second differences of a path, relative to squared distances from the track
@@ -52,10 +48,9 @@ def find_seeds(points: Float[np.ndarray, "P 3"], split: Split, most: int) -> See
     height, width = split.images.shape[1:3]
     backdrop = find_backdrop(points, split.cameras, height, width)
     cameras = backdrop.cameras
-    tracks = find_tracks(split, neighbour_flows(split), backdrop.depths.still)
     knots = path_knots(len(cameras.time))
     weights = np.asarray(path_weights(jnp.asarray(cameras.time), knots))
-    chosen = _moving_tracks(tracks, backdrop, most)
+    chosen = moving_tracks(split, backdrop, most)
     if not len(chosen.numbers):
         shapes = ((0, 3), (0, 3), (0,), (0, knots, 3), (0, 2))
         return Seeds(*(np.zeros(shape, np.float32) for shape in shapes))
@@ -65,30 +60,6 @@ def find_seeds(points: Float[np.ndarray, "P 3"], split: Split, most: int) -> See
     found = Seeds(*(np.array(rows, np.float32) for rows in zip(*seeds, strict=True)))
     order = z_order(found.points)
     return Seeds(*(rows[order] for rows in found))
-
-
-def _moving_tracks(tracks: Tracks, backdrop: Backdrop, most: int) -> Tracks:
-    """The tracks that are long enough and surely move, the longest ones first.
-
-    They are seen to move in enough of their frames, and leave the place where their first point, taken as static, would
-    appear at any candidate depth.
-    """
-    starts = np.flatnonzero(np.diff(tracks.numbers, prepend=-1))
-    lengths = np.diff(starts, append=len(tracks.numbers))
-    if not len(starts):
-        return tracks
-    cameras, first = backdrop.cameras, (tracks.frames[starts], tracks.pixels[starts])
-    deviations, viewmats, Ks = [], cameras.viewmat[tracks.frames], cameras.K[tracks.frames]
-    for still in backdrop.depths.still:
-        world = np.repeat(unprojected(cameras, *first, depths_at(still, *first)), lengths, axis=0)
-        static, _ = project_points(world, viewmats, Ks)
-        deviations.append(np.maximum.reduceat(np.linalg.norm(tracks.pixels - static, axis=-1), starts))
-    moving_share = np.add.reduceat(tracks.moves, starts) / lengths
-    deviates = np.min(deviations, axis=0) > MIN_DEVIATION  # not where a depth is NaN
-    kept = np.flatnonzero((lengths >= MIN_LENGTH) & (moving_share > MIN_MOVING_SHARE) & deviates)
-    chosen = kept[np.argsort(-lengths[kept], kind="stable")[:most]]
-    observed = np.concatenate([starts[i] + np.arange(lengths[i]) for i in chosen]) if len(chosen) else chosen
-    return Tracks(*(x[observed] for x in tracks))
 
 
 def _depths(

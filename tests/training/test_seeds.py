@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from clips import FOCAL, HEIGHT, WIDTH, clip
+from clips import FOCAL, HEIGHT, WIDTH, camera, clip, render
 from tiny_training import FRAMES, assert_equal_states, finish, make_dataset, state_of, tiny
 
 from l2dgs_jax.cameras.geometry import camera_centres, pixel_rays, points_inside
@@ -92,6 +92,21 @@ def test_what_moves_by_half_its_size_or_more_from_frame_to_frame_is_covered(ever
     seeds = find_seeds(surfaces(), few, MANY)
     for index, square in enumerate(squares[::every]):
         assert covered_share(square, places(seeds, few, index)) > 0.9
+
+
+def test_what_sets_off_slowly_is_followed_back_to_where_it_rested():
+    rest, acceleration, fastest = 5, 0.015, 0.09  # frames, and heights that are covered in a frame
+    heights = 0.5 - np.cumsum(np.clip(acceleration * (np.arange(COUNT) - rest + 1), 0, fastest))
+    views = [camera(0.1 * (2 * i / (COUNT - 1) - 1)) for i in range(COUNT)]
+    pictures, squares = zip(*(render(view, height) for view, height in zip(views, heights, strict=True)), strict=True)
+    images = 0.2 * np.stack(pictures) + np.random.default_rng(0).normal(0, 0.004, (COUNT, HEIGHT, WIDTH, 3))
+    cameras = Camera(np.stack(views).astype(np.float32), *filmed(block=True)[0].cameras[1:])
+    split = Split(tuple(map(str, range(COUNT))), cameras, np.clip(images, 0, 1).astype(np.float16))
+    seeds = find_seeds(surfaces(), split, MANY)
+    for frame in (0, rest - 2):
+        at = places(seeds, split, frame)
+        assert cv2.dilate(squares[frame].astype(np.uint8), np.ones((9, 9), np.uint8))[at].mean() > 0.85
+        assert covered_share(squares[frame], at) > 0.4
 
 
 def test_seeds_have_the_colours_of_the_moving_square():

@@ -1,0 +1,110 @@
+"""The tracks that are surely of moving things, and where these begin and end."""
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from l2dgs_jax.cameras.geometry import project_points
+from l2dgs_jax.data.dataset import Split
+from l2dgs_jax.training.backdrop import Backdrop, depths_at, unprojected
+from l2dgs_jax.training.background import differs_from_background, looks_like_background
+from l2dgs_jax.training.flows import Flows, neighbour_flows
+from l2dgs_jax.training.tracks import Tracks, by_track, find_tracks, followed_back, merged
+
+MIN_LENGTH = 3  # frames that a track must be seen in
+MIN_MOVING_SHARE = 0.4  # share of these frames in which it must be seen to move
+MIN_DEVIATION = 3.0  # pixels that a track must at some time be away from where a static point would appear
+MAX_START = 1.5  # pixels by which a track that sets off slowly deviates at first from a static point
+
+
+def moving_tracks(split: Split, backdrop: Backdrop, most: int) -> Tracks:
+    """Tracks of what surely moves, from before it sets off until it rests; none where no flow can be trusted.
+
+    Args:
+        split: the frames.
+        backdrop: the static scene behind.
+        most: how many tracks there may be; the longest ones come first.
+    """
+    flows = neighbour_flows(split)
+    chosen = _surely_moving(find_tracks(split, flows, backdrop.depths.still), backdrop, most)
+    return until_rest(from_rest(chosen, flows, split, backdrop), split, backdrop)
+
+
+def _surely_moving(tracks: Tracks, backdrop: Backdrop, most: int) -> Tracks:
+    """The tracks that are long enough and surely move, the longest ones first.
+
+    They are seen to move in enough of their frames, and leave the place where their first point, taken as static, would
+    appear at any candidate depth.
+    """
+    starts = np.flatnonzero(np.diff(tracks.numbers, prepend=-1))
+    lengths = np.diff(starts, append=len(tracks.numbers))
+    if not len(starts):
+        return tracks
+    moving_share = np.add.reduceat(tracks.moves, starts) / lengths
+    deviations = _deviations(tracks, np.repeat(starts, lengths), np.arange(len(tracks.numbers)), backdrop)
+    deviates = np.maximum.reduceat(deviations, starts, axis=1).min(0) > MIN_DEVIATION  # not where a depth is NaN
+    kept = np.flatnonzero((lengths >= MIN_LENGTH) & (moving_share > MIN_MOVING_SHARE) & deviates)
+    chosen = kept[np.argsort(-lengths[kept], kind="stable")[:most]]
+    observed = np.concatenate([starts[i] + np.arange(lengths[i]) for i in chosen]) if len(chosen) else chosen
+    return Tracks(*(x[observed] for x in tracks))
+
+
+def _deviations(
+    tracks: Tracks, first: Int[np.ndarray, " N"], then: Int[np.ndarray, " N"], backdrop: Backdrop
+) -> Float[np.ndarray, "C N"]:
+    """Pixels between observations and where others, if they were static, would appear beside them.
+
+    Args:
+        tracks: all observations.
+        first: those that are taken as static, at each of C candidates of their depth, some of which may be NaN.
+        then: what they are compared with.
+        backdrop: the static scene.
+    """
+    cameras, frames, pixels = backdrop.cameras, tracks.frames, tracks.pixels
+    deviations = []
+    for still in backdrop.depths.still:
+        world = unprojected(cameras, frames[first], pixels[first], depths_at(still, frames[first], pixels[first]))
+        static, _ = project_points(world, cameras.viewmat[frames[then]], cameras.K[frames[then]])
+        deviations.append(np.linalg.norm(pixels[then] - static, axis=-1))
+    return np.array(deviations)
+
+
+def from_rest(tracks: Tracks, flows: Flows, split: Split, backdrop: Backdrop) -> Tracks:
+    """The tracks, and what flow says of those that set off slowly before they were seen to move.
+
+    It is believed as long as they differ there from the background that is seen in their place once they are gone.
+
+    Args:
+        tracks: each of two observations or more.
+        flows: that they were found by.
+        split: the frames.
+        backdrop: the static scene behind.
+    """
+    times = backdrop.cameras.time
+    numbers, starts = np.unique(tracks.numbers, return_index=True)
+    slow = _deviations(tracks, starts, starts + 1, backdrop).min(0) < MAX_START
+    earlier = followed_back(tracks, flows, times)
+    track = np.searchsorted(numbers, earlier.numbers)
+    since = times[tracks.frames[starts]][track]
+    together = merged([tracks, earlier], times)
+    differs = differs_from_background(earlier.frames, earlier.pixels, split, backdrop, together, since)
+    believed = [np.flip(np.logical_and.accumulate(np.flip(part))) for part in by_track(earlier, slow[track] & differs)]
+    kept = np.concatenate(believed)
+    return merged([tracks, Tracks(*(x[kept] for x in earlier))], times)
+
+
+def until_rest(tracks: Tracks, split: Split, backdrop: Backdrop) -> Tracks:
+    """The tracks without what follows once they no longer move and show the background: flow has lost them there.
+
+    Those of which little remains are left out.
+
+    Args:
+        tracks: of moving things.
+        split: the frames.
+        backdrop: the static scene behind.
+    """
+    background = looks_like_background(tracks.frames, tracks.pixels, split, backdrop, tracks)
+    moved = [np.flip(np.logical_or.accumulate(np.flip(part))) for part in by_track(tracks, tracks.moves)]
+    lost = by_track(tracks, background & ~np.concatenate(moved))
+    kept = [~np.logical_or.accumulate(part) for part in lost]
+    long_enough = [part & (part.sum() >= MIN_LENGTH) for part in kept]
+    return Tracks(*(x[np.concatenate(long_enough)] for x in tracks))
