@@ -28,7 +28,8 @@ def looks_like_background(
 ) -> Bool[np.ndarray, " N"]:
     """Which pixels of frames have the colours of the static surfaces behind them, or darker ones.
 
-    These surfaces are seen in other frames, where nothing moves before them. Where they are not, the answer is no.
+    These surfaces are seen in other frames, where nothing moves before them. Where they are not, and for pixels that
+    are not valid, the answer is no.
 
     Args:
         frames: indices of the frames.
@@ -37,7 +38,7 @@ def looks_like_background(
         backdrop: of these.
         tracks: what seems to move there.
     """
-    _, alike = _compared(frames, pixels, split, backdrop, tracks, np.full(len(frames), -np.inf))
+    _, alike = _compared(frames, pixels, split, backdrop, tracks)
     return alike
 
 
@@ -47,13 +48,9 @@ def differs_from_background(
     split: Split,
     backdrop: Backdrop,
     tracks: Tracks,
-    since: Float[np.ndarray, " N"],
 ) -> Bool[np.ndarray, " N"]:
-    """Which pixels of frames show other colours than the static surfaces behind them, as seen after the time `since`.
-
-    Where these are not seen, the answer is no. The other arguments are those of `looks_like_background`.
-    """
-    known, alike = _compared(frames, pixels, split, backdrop, tracks, since)
+    """Which pixels of frames are known to have other colours; arguments as in `looks_like_background`."""
+    known, alike = _compared(frames, pixels, split, backdrop, tracks)
     return known & ~alike
 
 
@@ -63,18 +60,19 @@ def _compared(
     split: Split,
     backdrop: Backdrop,
     tracks: Tracks,
-    since: Float[np.ndarray, " N"],
 ) -> tuple[Bool[np.ndarray, " N"], Bool[np.ndarray, " N"]]:
-    """Whether the surfaces behind are seen after some time, and whether pixels are known to look like them."""
+    """Whether it is known what is behind pixels, and whether they are known to look like it."""
     height, width = split.images.shape[1:3]
-    viewmats, Ks, times = backdrop.cameras
+    viewmats, Ks, _ = backdrop.cameras
     surfaces = unprojected(backdrop.cameras, frames, pixels, hidden_depths(backdrop, frames, pixels))
     chosen = np.unique(np.linspace(0, len(viewmats) - 1, MAX_FRAMES).round().astype(int)).tolist()
     elsewhere = np.full((len(chosen), len(surfaces), 3), np.nan, np.float32)
     here = np.zeros((len(surfaces), 3), np.float32)
-    for frame in range(len(viewmats)):
-        light = _smooth_light(split.images[frame])
+    for frame in range(len(viewmats)) if len(surfaces) else ():
         asked = frames == frame
+        if frame not in chosen and not asked.any():
+            continue
+        light = _smooth_light(split.images[frame])
         column, row = pixels[asked].astype(int).T
         here[asked] = light[row, column]
         if frame in chosen:
@@ -85,12 +83,14 @@ def _compared(
             if split.valid is not None:
                 free &= split.valid[frame]
             places, depth = project_points(surfaces, viewmats[frame], Ks[frame])
-            inside = ((places >= 0) & (places < (width, height))).all(-1)  # never NaN
-            seen = np.flatnonzero((depth > 0) & inside & (times[frame] > since))
+            seen = np.flatnonzero((depth > 0) & ((places >= 0) & (places < (width, height))).all(-1))  # never NaN
             column, row = places[seen].astype(int).T
             at = free[row, column]
             elsewhere[chosen.index(frame), seen[at]] = light[row[at], column[at]]
     known, alike = np.isfinite(elsewhere[..., 0]).sum(0) >= MIN_SEEN, np.zeros(len(surfaces), bool)
+    if split.valid is not None:
+        column, row = pixels.astype(int).T
+        known &= split.valid[frames, row, column]
     if known.any():
         alike[known] = _alike(here[known], np.nanmedian(elsewhere[:, known], axis=0))
     return known, alike

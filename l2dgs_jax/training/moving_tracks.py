@@ -1,19 +1,21 @@
 """The tracks that are surely of moving things, and where these begin and end."""
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from l2dgs_jax.cameras.geometry import project_points
 from l2dgs_jax.data.dataset import Split
 from l2dgs_jax.training.backdrop import Backdrop, depths_at, unprojected
 from l2dgs_jax.training.background import differs_from_background, looks_like_background
 from l2dgs_jax.training.flows import Flows, neighbour_flows
-from l2dgs_jax.training.tracks import Tracks, by_track, find_tracks, followed_back, merged
+from l2dgs_jax.training.tracks import MIN_DEVIATION, Tracks, by_track, find_tracks, followed_back, in_order
 
 MIN_LENGTH = 3  # frames that a track must be seen in
 MIN_MOVING_SHARE = 0.4  # share of these frames in which it must be seen to move
-MIN_DEVIATION = 3.0  # pixels that a track must at some time be away from where a static point would appear
-MAX_START = 1.5  # pixels by which a track that sets off slowly deviates at first from a static point
+MIN_DEPARTURE = 3.0  # pixels that a track must at some time be away from where a static point would appear
+# Pixels by which what sets off slowly deviates in its first step; tracks begin where it is more than MIN_DEVIATION.
+# What is faster at first has come out from behind something, or into the picture.
+MAX_START = 1.5
 
 
 def moving_tracks(split: Split, backdrop: Backdrop, most: int) -> Tracks:
@@ -22,7 +24,7 @@ def moving_tracks(split: Split, backdrop: Backdrop, most: int) -> Tracks:
     Args:
         split: the frames.
         backdrop: the static scene behind.
-        most: how many tracks there may be; the longest ones come first.
+        most: how many tracks there may be; the longest ones are preferred.
     """
     flows = neighbour_flows(split)
     chosen = _surely_moving(find_tracks(split, flows, backdrop.depths.still), backdrop, most)
@@ -41,7 +43,7 @@ def _surely_moving(tracks: Tracks, backdrop: Backdrop, most: int) -> Tracks:
         return tracks
     moving_share = np.add.reduceat(tracks.moves, starts) / lengths
     deviations = _deviations(tracks, np.repeat(starts, lengths), np.arange(len(tracks.numbers)), backdrop)
-    deviates = np.maximum.reduceat(deviations, starts, axis=1).min(0) > MIN_DEVIATION  # not where a depth is NaN
+    deviates = np.maximum.reduceat(deviations, starts, axis=1).min(0) > MIN_DEPARTURE  # not where a depth is NaN
     kept = np.flatnonzero((lengths >= MIN_LENGTH) & (moving_share > MIN_MOVING_SHARE) & deviates)
     chosen = kept[np.argsort(-lengths[kept], kind="stable")[:most]]
     observed = np.concatenate([starts[i] + np.arange(lengths[i]) for i in chosen]) if len(chosen) else chosen
@@ -51,12 +53,12 @@ def _surely_moving(tracks: Tracks, backdrop: Backdrop, most: int) -> Tracks:
 def _deviations(
     tracks: Tracks, first: Int[np.ndarray, " N"], then: Int[np.ndarray, " N"], backdrop: Backdrop
 ) -> Float[np.ndarray, "C N"]:
-    """Pixels between observations and where others, if they were static, would appear beside them.
+    """Pixels from observations to where others, taken as static, would appear in the same frame.
 
     Args:
         tracks: all observations.
         first: those that are taken as static, at each of C candidates of their depth, some of which may be NaN.
-        then: what they are compared with.
+        then: those that are compared with them.
         backdrop: the static scene.
     """
     cameras, frames, pixels = backdrop.cameras, tracks.frames, tracks.pixels
@@ -68,32 +70,42 @@ def _deviations(
     return np.array(deviations)
 
 
+def _steps(tracks: Tracks, backdrop: Backdrop) -> Float[np.ndarray, " O"]:
+    """Pixels by which the step from each observation to the next one deviates from a static point; 0 at the last."""
+    before = np.flatnonzero(np.diff(tracks.numbers) == 0)
+    steps = np.zeros(len(tracks.numbers))
+    steps[before] = _deviations(tracks, before, before + 1, backdrop).min(0)
+    return steps
+
+
+def _then_or_later(tracks: Tracks, holds: Bool[np.ndarray, " O"]) -> Bool[np.ndarray, " O"]:
+    """Whether something holds for each observation or for a later one of its track."""
+    return np.concatenate([np.flip(np.logical_or.accumulate(np.flip(part))) for part in by_track(tracks, holds)])
+
+
 def from_rest(tracks: Tracks, flows: Flows, split: Split, backdrop: Backdrop) -> Tracks:
     """The tracks, and what flow says of those that set off slowly before they were seen to move.
 
-    It is believed as long as they differ there from the background that is seen in their place once they are gone.
+    It is believed as long as they differ there from the background that is seen in their place at other times.
 
     Args:
-        tracks: each of two observations or more.
+        tracks: of moving things.
         flows: that they were found by.
         split: the frames.
         backdrop: the static scene behind.
     """
     times = backdrop.cameras.time
-    numbers, starts = np.unique(tracks.numbers, return_index=True)
-    slow = _deviations(tracks, starts, starts + 1, backdrop).min(0) < MAX_START
-    earlier = followed_back(tracks, flows, times)
-    track = np.searchsorted(numbers, earlier.numbers)
-    since = times[tracks.frames[starts]][track]
-    together = merged([tracks, earlier], times)
-    differs = differs_from_background(earlier.frames, earlier.pixels, split, backdrop, together, since)
-    believed = [np.flip(np.logical_and.accumulate(np.flip(part))) for part in by_track(earlier, slow[track] & differs)]
-    kept = np.concatenate(believed)
-    return merged([tracks, Tracks(*(x[kept] for x in earlier))], times)
+    numbers, begins = np.unique(tracks.numbers, return_index=True)
+    slow = numbers[_steps(tracks, backdrop)[begins] < MAX_START]
+    earlier = followed_back(tracks, slow, flows, times)
+    together = in_order([tracks, earlier], times)
+    differs = differs_from_background(earlier.frames, earlier.pixels, split, backdrop, together)
+    believed = ~_then_or_later(earlier, ~differs)
+    return in_order([tracks, Tracks(*(x[believed] for x in earlier))], times)
 
 
 def until_rest(tracks: Tracks, split: Split, backdrop: Backdrop) -> Tracks:
-    """The tracks without what follows once they no longer move and show the background: flow has lost them there.
+    """The tracks without what follows once they rest and show the background: flow has lost them there.
 
     Those of which little remains are left out.
 
@@ -103,8 +115,9 @@ def until_rest(tracks: Tracks, split: Split, backdrop: Backdrop) -> Tracks:
         backdrop: the static scene behind.
     """
     background = looks_like_background(tracks.frames, tracks.pixels, split, backdrop, tracks)
-    moved = [np.flip(np.logical_or.accumulate(np.flip(part))) for part in by_track(tracks, tracks.moves)]
-    lost = by_track(tracks, background & ~np.concatenate(moved))
+    moves = _steps(tracks, backdrop) > MIN_DEVIATION
+    moves[1:] |= moves[:-1]  # to it or from it
+    lost = by_track(tracks, background & ~_then_or_later(tracks, moves))
     kept = [~np.logical_or.accumulate(part) for part in lost]
     long_enough = [part & (part.sum() >= MIN_LENGTH) for part in kept]
     return Tracks(*(x[np.concatenate(long_enough)] for x in tracks))

@@ -5,7 +5,7 @@ from typing import NamedTuple, TypeVar
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float16, Float32, Int, Shaped, UInt8
+from jaxtyping import Bool, Float, Float32, Int, Shaped, UInt8
 
 from l2dgs_jax.cameras.epipolar import epipolar_geometry, project
 from l2dgs_jax.cameras.flow import brightened, pixel_indices
@@ -37,7 +37,7 @@ class Tracks(NamedTuple):
 
 
 def by_track(tracks: Tracks, values: Shaped[np.ndarray, "O ..."]) -> list[Shaped[np.ndarray, "_ ..."]]:
-    """Values of all observations, track by track; there is at least one."""
+    """Values of all observations, track by track; if there are none, a single empty array."""
     return np.split(values, np.flatnonzero(np.diff(tracks.numbers)) + 1)
 
 
@@ -100,44 +100,46 @@ def find_tracks(split: Split, flows: Flows, depths: Float32[np.ndarray, "C F h w
         count += len(fresh)
         observed.append(_seen(heads, frame, moves))
         arrived[following].append(_carried(heads, flow, deviations))
-    return merged(observed, times)
+    return in_order(observed, times)
 
 
-def followed_back(tracks: Tracks, flows: Flows, times: Float[np.ndarray, " F"]) -> Tracks:
+def followed_back(
+    tracks: Tracks, numbers: Int[np.ndarray, " N"], flows: Flows, times: Float[np.ndarray, " F"]
+) -> Tracks:
     """Earlier observations of tracks: where flow says that they were before they began, moving or not.
 
-    As long as it can be trusted, and no other track is there.
+    As long as it can be trusted, and no track is there; of several that arrive in one place, only the first goes on.
 
     Args:
         tracks: as found.
+        numbers: of those to follow.
         flows: between the frames.
         times: of the frames.
     """
-    observed = {frame: Tracks(*(x[tracks.frames == frame] for x in tracks)) for frame in range(len(times))}
-    found = [Tracks(*(x[:0] for x in tracks))]
+    height, width = flows.displacements.shape[2:4]
+    found, begins = np.unique(tracks.numbers, return_index=True)
+    begins = begins[np.isin(found, numbers)]
+    numbers, frames, pixels = tracks.numbers[begins], tracks.frames[begins], tracks.pixels[begins]
+    earlier = [Tracks(*(x[:0] for x in tracks))]
     for frame in np.argsort(-times, kind="stable").tolist():
         following = int(flows.following[frame])
-        if following != frame:
-            found.append(_earlier(frame, observed[frame], observed[following], flows.displacements[frame, 1]))
-            observed[frame] = _joined([observed[frame], found[-1]])
-    return merged(found, times)
+        if following == frame:
+            continue
+        heads = np.flatnonzero(frames == following)
+        places = pixels[heads] + _at(flows.displacements[frame, 1].astype(np.float32), pixels[heads])
+        free = ((places >= 0) & (places < (width, height))).all(-1)  # not where flow is NaN
+        taken = _cells(tracks.pixels[tracks.frames == frame], width)
+        free[free] = ~np.isin(_cells(places[free], width), taken)
+        heads, places = heads[free], places[free]
+        one = np.unique(_cells(places, width), return_index=True)[1]
+        heads, places = heads[one], places[one]
+        frames[heads], pixels[heads] = frame, places
+        earlier.append(Tracks(numbers[heads], frames[heads], places, np.zeros(len(heads), bool)))
+    return in_order(earlier, times)
 
 
-def _earlier(frame: int, here: Tracks, later: Tracks, flow: Float16[np.ndarray, "H W 2"]) -> Tracks:
-    """Observations in a frame of those tracks that are not here, but later; `flow` is that from later to here."""
-    height, width = flow.shape[:2]
-    begins = ~np.isin(later.numbers, here.numbers)
-    numbers, pixels = later.numbers[begins], later.pixels[begins]
-    pixels = pixels + _at(flow.astype(np.float32), pixels)
-    free = ((pixels >= 0) & (pixels < (width, height))).all(-1)  # not where flow is NaN
-    free[free] = ~np.isin(_cells(pixels[free], width), _cells(here.pixels, width))
-    numbers, pixels = numbers[free], pixels[free]
-    one = np.unique(_cells(pixels, width), return_index=True)[1]
-    return Tracks(numbers[one], np.full(len(one), frame), pixels[one], np.zeros(len(one), bool))
-
-
-def merged(parts: Sequence[Tracks], times: Float[np.ndarray, " F"]) -> Tracks:
-    """All observations, grouped by track and in order of time."""
+def in_order(parts: Sequence[Tracks], times: Float[np.ndarray, " F"]) -> Tracks:
+    """All observations together, grouped by track and in order of time."""
     together = _joined(parts)
     order = np.lexsort((times[together.frames], together.numbers))
     return Tracks(*(x[order] for x in together))
