@@ -6,6 +6,7 @@ import numpy as np
 from experiments.makers.scenery import Parts, Pose, Scene, held, limb, paint
 
 BOWL = np.array([0.08, 0.02, 0.0])
+TURNS = 2.2  # of the spoon
 BOOKS = (  # centre, half the sides, degrees
     ((-0.12, 0.42, 0.04), (0.14, 0.1, 0.04), 12),
     ((-0.1, 0.43, 0.1), (0.11, 0.09, 0.02), -20),
@@ -15,21 +16,19 @@ BOOKS = (  # centre, half the sides, degrees
 
 
 def stir(time: float) -> Parts:
-    """The spoon goes round; the box sets off slowly."""
+    """The spoon goes round; the box gathers speed."""
     skin = paint(22, [0.6, 0.4, 0.3], [0.78, 0.58, 0.47], (4, 4))
     sleeve = paint(20, [0.15, 0.2, 0.45], [0.5, 0.6, 0.8], (6, 8))
     wood = paint(24, [0.4, 0.25, 0.1], [0.7, 0.5, 0.3], (2, 6))
-    cos, sin = np.cos(2 * np.pi * 2.2 * time), np.sin(2 * np.pi * 2.2 * time)
+    angle = 2 * np.pi * TURNS * time
+    cos, sin = np.cos(angle), np.sin(angle)
     tip = BOWL + np.array([0.05 * cos, 0.05 * sin, 0.05])
     hand = tip + np.array([0.03 + 0.01 * cos, -0.02, 0.15])
     wrist = hand + np.array([0.07, -0.04, 0.04])
     elbow = np.array([0.55 + 0.02 * cos, -0.25 + 0.02 * sin, 0.25])
     place = np.array([-0.45 + 0.3 * time - 0.04 * np.sin(6 * time), -0.2 + 0.03 * np.sin(5 * time), 0.04])
-    fist, forearm, pushing = (
-        place + np.array([-0.07, -0.03, 0.01]),
-        place + np.array([-0.14, -0.09, 0.04]),
-        place + np.array([-0.5, -0.35, 0.16]),
-    )
+    fist = place + np.array([-0.07, -0.03, 0.01])
+    joint, behind = place + np.array([-0.14, -0.09, 0.04]), place + np.array([-0.5, -0.35, 0.16])
     box = {
         "type": "cube",
         "to_world": mi.ScalarTransform4f().translate(place).rotate([0, 0, 1], 30 * time).scale([0.06, 0.04, 0.04]),
@@ -41,7 +40,7 @@ def stir(time: float) -> Parts:
         | limb("finger", [hand + np.array([-0.01, 0.02, -0.02]), hand + np.array([0.03, 0.035, 0.0])], 0.013, skin)
         | limb("arm", [wrist, elbow, elbow + np.array([0.4, -0.2, 0.15])], 0.045, sleeve)
         | {"box": box}
-        | limb("push", [fist, forearm, pushing], 0.03, skin)
+        | limb("push", [fist, joint, behind], 0.03, skin)
     )
 
 

@@ -7,7 +7,7 @@ from l2dgs_jax.cameras.geometry import project_points
 from l2dgs_jax.data import load_dataset, nerfies
 
 FRAMES = 4
-SEEN = {"walk": "head0", "approach": "head0", "crowd": "nearhead0", "table": "hand0"}  # what nothing hides
+SEEN = {"walk": "head0", "approach": "head0", "crowd": "nearhead0", "table": "hand0"}  # a part that nothing hides
 
 
 @pytest.fixture(scope="module", params=sorted(make_scene.SCENES))
@@ -47,6 +47,6 @@ def test_points_lie_on_what_stands_still(dataset):
         points = dataset.points[i * per_frame : (i + 1) * per_frame]
         pixels, depth = project_points(points, cameras.viewmat[i], cameras.K[i])
         column, row = np.floor(pixels).astype(int).T
-        assert (depth > 2 * make_scene.SCENES[dataset.name].baseline).all()
+        assert (depth > 2 * make_scene.SCENES[dataset.name].baseline).all()  # nothing is close to the camera
         assert not masks[i, row.clip(0, masks.shape[1] - 1), column.clip(0, masks.shape[2] - 1)].any()
     assert dataset.points[:, 2].min() > -0.1  # nothing is below the ground

@@ -95,7 +95,7 @@ def test_what_moves_by_half_its_size_or_more_from_frame_to_frame_is_covered(ever
 
 
 def test_what_sets_off_slowly_is_followed_back_to_where_it_rested():
-    rest, acceleration, fastest = 5, 0.015, 0.09  # frames, and heights that are covered in a frame
+    rest, acceleration, fastest = 5, 0.015, 0.09  # frames at rest; then how much faster a frame, up to what speed
     heights = 0.5 - np.cumsum(np.clip(acceleration * (np.arange(COUNT) - rest + 1), 0, fastest))
     views = [camera(0.1 * (2 * i / (COUNT - 1) - 1)) for i in range(COUNT)]
     pictures, squares = zip(*(render(view, height) for view, height in zip(views, heights, strict=True)), strict=True)
