@@ -1,5 +1,7 @@
 """What seems to move, but is the static scene: shadows, and what flow drags along beside moving objects."""
 
+from typing import NamedTuple
+
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
@@ -19,17 +21,29 @@ SHADE = 0.35, 1.1  # light in a shadow over that outside, at least and at most
 TINT = 0.15  # difference in log-light of a channel from the mean of all channels: a shadow changes colours little
 
 
-def looks_like_background(
+class Likeness(NamedTuple):
+    """How pixels compare with the static surfaces behind them; neither is true where these are not known.
+
+    Attributes:
+        alike: whether they have the same colours, or darker ones.
+        differs: whether they have others.
+    """
+
+    alike: Bool[np.ndarray, " N"]
+    differs: Bool[np.ndarray, " N"]
+
+
+def likeness_to_background(
     frames: Int[np.ndarray, " N"],
     pixels: Float[np.ndarray, "N 2"],
     split: Split,
     backdrop: Backdrop,
     tracks: Tracks,
-) -> Bool[np.ndarray, " N"]:
-    """Which pixels of frames have the colours of the static surfaces behind them, or darker ones.
+) -> Likeness:
+    """Compare pixels of frames with the static surfaces behind them.
 
-    These surfaces are seen in other frames, where nothing moves before them. Where they are not, and for pixels that
-    are not valid, the answer is no.
+    These surfaces are seen in other frames, where nothing moves before them. Where they are not, nothing is known, nor
+    is it for pixels that are not valid.
 
     Args:
         frames: indices of the frames.
@@ -38,30 +52,6 @@ def looks_like_background(
         backdrop: of these.
         tracks: what seems to move there.
     """
-    _, alike = _compared(frames, pixels, split, backdrop, tracks)
-    return alike
-
-
-def differs_from_background(
-    frames: Int[np.ndarray, " N"],
-    pixels: Float[np.ndarray, "N 2"],
-    split: Split,
-    backdrop: Backdrop,
-    tracks: Tracks,
-) -> Bool[np.ndarray, " N"]:
-    """Which pixels of frames are known to have other colours; arguments as in `looks_like_background`."""
-    known, alike = _compared(frames, pixels, split, backdrop, tracks)
-    return known & ~alike
-
-
-def _compared(
-    frames: Int[np.ndarray, " N"],
-    pixels: Float[np.ndarray, "N 2"],
-    split: Split,
-    backdrop: Backdrop,
-    tracks: Tracks,
-) -> tuple[Bool[np.ndarray, " N"], Bool[np.ndarray, " N"]]:
-    """Whether it is known what is behind pixels, and whether they are known to look like it."""
     height, width = split.images.shape[1:3]
     viewmats, Ks, _ = backdrop.cameras
     surfaces = unprojected(backdrop.cameras, frames, pixels, hidden_depths(backdrop, frames, pixels))
@@ -93,7 +83,7 @@ def _compared(
         known &= split.valid[frames, row, column]
     if known.any():
         alike[known] = _alike(here[known], np.nanmedian(elsewhere[:, known], axis=0))
-    return known, alike
+    return Likeness(alike, known & ~alike)
 
 
 def _alike(here: Float32[np.ndarray, "N 3"], elsewhere: Float32[np.ndarray, "N 3"]) -> Bool[np.ndarray, " N"]:

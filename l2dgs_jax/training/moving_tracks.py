@@ -6,7 +6,7 @@ from jaxtyping import Bool, Float, Int
 from l2dgs_jax.cameras.geometry import project_points
 from l2dgs_jax.data.dataset import Split
 from l2dgs_jax.training.backdrop import Backdrop, depths_at, unprojected
-from l2dgs_jax.training.background import differs_from_background, looks_like_background
+from l2dgs_jax.training.background import likeness_to_background
 from l2dgs_jax.training.flows import Flows, neighbour_flows
 from l2dgs_jax.training.tracks import MIN_DEVIATION, Tracks, by_track, find_tracks, followed_back, in_order
 
@@ -99,8 +99,8 @@ def from_rest(tracks: Tracks, flows: Flows, split: Split, backdrop: Backdrop) ->
     slow = numbers[_steps(tracks, backdrop)[begins] < MAX_START]
     earlier = followed_back(tracks, slow, flows, times)
     together = in_order([tracks, earlier], times)
-    differs = differs_from_background(earlier.frames, earlier.pixels, split, backdrop, together)
-    believed = ~_then_or_later(earlier, ~differs)
+    likeness = likeness_to_background(earlier.frames, earlier.pixels, split, backdrop, together)
+    believed = ~_then_or_later(earlier, ~likeness.differs)
     return in_order([tracks, Tracks(*(x[believed] for x in earlier))], times)
 
 
@@ -114,7 +114,7 @@ def until_rest(tracks: Tracks, split: Split, backdrop: Backdrop) -> Tracks:
         split: the frames.
         backdrop: the static scene behind.
     """
-    background = looks_like_background(tracks.frames, tracks.pixels, split, backdrop, tracks)
+    background = likeness_to_background(tracks.frames, tracks.pixels, split, backdrop, tracks).alike
     moves = _steps(tracks, backdrop) > MIN_DEVIATION
     moves[1:] |= moves[:-1]  # to it or from it
     lost = by_track(tracks, background & ~_then_or_later(tracks, moves))

@@ -4,11 +4,9 @@ Points from structure from motion lie on static surfaces. A motion field that st
 out which of them to move where; tracks of optical flow tell before training begins.
 """
 
-from functools import partial
-
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Shaped
+from jaxtyping import Bool, Float, Int, Shaped
 
 from l2dgs_jax.cameras.geometry import camera_centres, pixel_rays
 from l2dgs_jax.cameras.ground import horizontal_per_depth
@@ -23,7 +21,7 @@ from l2dgs_jax.training.backdrop import (
     hidden_depths,
     unprojected,
 )
-from l2dgs_jax.training.background import looks_like_background
+from l2dgs_jax.training.background import likeness_to_background
 from l2dgs_jax.training.depths import Sights, shared_depths
 from l2dgs_jax.training.feet import find_feet, find_soles, just_below
 from l2dgs_jax.training.given_depth import in_world_units
@@ -67,7 +65,10 @@ def _depths(
 ) -> Float[np.ndarray, " O"]:
     """Depths of the observations, world units; tracks that show the background lie on it."""
     depths = hidden_depths(backdrop, tracks.frames, tracks.pixels)
-    is_background = partial(looks_like_background, split=split, backdrop=backdrop, tracks=tracks)
+
+    def is_background(frames: Int[np.ndarray, " N"], pixels: Float[np.ndarray, "N 2"]) -> Bool[np.ndarray, " N"]:
+        return likeness_to_background(frames, pixels, split, backdrop, tracks).alike
+
     background = is_background(tracks.frames, tracks.pixels)
     shows_background = share_in_track(tracks, background) > BACKGROUND_SHARE
     others = ~shows_background | (share_in_track(tracks, np.isnan(depths)) > 0)

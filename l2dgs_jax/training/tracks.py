@@ -127,7 +127,7 @@ def followed_back(
             continue
         heads = np.flatnonzero(frames == following)
         places = pixels[heads] + _at(flows.displacements[frame, 1].astype(np.float32), pixels[heads])
-        free = ((places >= 0) & (places < (width, height))).all(-1)  # not where flow is NaN
+        free = _inside(places, height, width)
         taken = _cells(tracks.pixels[tracks.frames == frame], width)
         free[free] = ~np.isin(_cells(places[free], width), taken)
         heads, places = heads[free], places[free]
@@ -148,6 +148,11 @@ def in_order(parts: Sequence[Tracks], times: Float[np.ndarray, " F"]) -> Tracks:
 def _joined(parts: Sequence[T]) -> T:
     """All of them as one, in that order."""
     return type(parts[0])(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
+
+
+def _inside(pixels: Float[np.ndarray, "N 2"], height: int, width: int) -> Bool[np.ndarray, " N"]:
+    """Which pixels lie within a frame; not where they are NaN, as flow is that is not trusted."""
+    return np.all((pixels >= 0) & (pixels < (width, height)), axis=-1)
 
 
 def _cells(pixels: Float[np.ndarray, "N 2"], width: int) -> Int[np.ndarray, " N"]:
@@ -171,8 +176,7 @@ def _seen(heads: _Heads, frame: int, moves: Bool[np.ndarray, "H W"]) -> Tracks:
 def _carried(heads: _Heads, flow: Float32[np.ndarray, "H W 2"], deviations: Float32[np.ndarray, "H W"]) -> _Heads:
     """The tracks that flow carries to a place in the following frame; it is NaN where it is not to be trusted."""
     ends = heads.pixels + _at(flow, heads.pixels)
-    height, width = deviations.shape
-    inside = ((ends >= 0) & (ends < (width, height))).all(-1)  # not where flow is NaN
+    inside = _inside(ends, *deviations.shape)
     latest = np.nan_to_num(_at(deviations, heads.pixels))
     average = (1 - UPDATE_WEIGHT) * heads.deviations + UPDATE_WEIGHT * latest
     return _Heads(heads.numbers[inside], ends[inside], average[inside])

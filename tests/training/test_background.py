@@ -7,13 +7,13 @@ import pytest
 from moving_squares import ROWS, SIDE, backdrop, seen
 
 from l2dgs_jax.training import background
-from l2dgs_jax.training.background import differs_from_background, looks_like_background
+from l2dgs_jax.training.background import likeness_to_background
 from l2dgs_jax.training.tracks import share_in_track
 
 
 def found(split, tracks, behind=None):
     """Shares of the observations that look like the background."""
-    looks = looks_like_background(tracks.frames, tracks.pixels, split, behind or backdrop(split), tracks)
+    looks = likeness_to_background(tracks.frames, tracks.pixels, split, behind or backdrop(split), tracks).alike
     return dict(zip(ROWS, share_in_track(tracks, looks)[:: len(looks) // 3].tolist(), strict=True))
 
 
@@ -27,7 +27,7 @@ def test_a_shadow_shows_the_background_but_not_an_object_nor_a_light():
 
 def test_an_object_and_a_light_differ_from_the_background_but_not_a_shadow():
     split, tracks = seen()
-    differs = differs_from_background(tracks.frames, tracks.pixels, split, backdrop(split), tracks)
+    differs = likeness_to_background(tracks.frames, tracks.pixels, split, backdrop(split), tracks).differs
     shares = dict(zip(ROWS, differs.reshape(len(ROWS), -1).mean(1).tolist(), strict=True))
     assert shares["shadow"] == 0
     assert min(shares["object"], shares["bright"]) > 0.9
@@ -36,7 +36,7 @@ def test_an_object_and_a_light_differ_from_the_background_but_not_a_shadow():
 def test_nothing_differs_from_what_is_never_seen_elsewhere(monkeypatch):
     monkeypatch.setattr(background, "REACH", 2 * SIDE)
     split, tracks = seen()
-    assert not differs_from_background(tracks.frames, tracks.pixels, split, backdrop(split), tracks).any()
+    assert not likeness_to_background(tracks.frames, tracks.pixels, split, backdrop(split), tracks).differs.any()
 
 
 def test_noise_is_no_colour():
@@ -61,7 +61,7 @@ def test_a_surface_that_is_never_seen_elsewhere_is_not_shown(monkeypatch):
 def test_other_pixels_than_those_of_tracks_can_be_asked_about():
     split, tracks = seen()
     pixels = np.array([[10.5, ROWS["object"] + 0.5], [60.5, ROWS["object"] + 0.5]])
-    looks = looks_like_background(np.zeros(2, int), pixels, split, backdrop(split), tracks)
+    looks = likeness_to_background(np.zeros(2, int), pixels, split, backdrop(split), tracks).alike
     assert looks.tolist() == [False, True]
 
 
@@ -71,8 +71,7 @@ def test_of_pixels_that_are_not_valid_nothing_is_said():
     split.valid[3] = False
     here = tracks.frames == 3
     asked = tracks.frames[here], tracks.pixels[here], split, backdrop(split), tracks
-    assert not looks_like_background(*asked).any()
-    assert not differs_from_background(*asked).any()
+    assert not np.any(likeness_to_background(*asked))
 
 
 def test_pixels_that_are_not_valid_do_not_tell():

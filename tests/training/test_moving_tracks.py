@@ -27,27 +27,24 @@ def resting(last, first=0):
     return split, ALL._replace(pixels=places)
 
 
-def until(begin, stuck):
+def until(begin, split=SPLIT, stuck=7):
     """Frames that remain of the object's track, if it begins in a frame and is later stuck on the background."""
     track = only(OBJECT)
     pixels = np.where((track.frames >= stuck)[:, None], track.pixels[stuck - 2], track.pixels)
     lost = Tracks(*(x[begin:] for x in track._replace(pixels=pixels)))
-    return until_rest(lost, SPLIT, backdrop(SPLIT)).frames.tolist()
+    return until_rest(lost, split, backdrop(split)).frames.tolist()
 
 
 @pytest.mark.parametrize(("begin", "remain"), [(0, [0, 1, 2, 3, 4, 5, 6]), (4, [4, 5, 6])])
 def test_a_track_ends_where_it_shows_the_background_at_rest(begin, remain):
-    assert until(begin, 7)[: len(remain)] == remain
-    assert len(until(begin, 7)) <= len(remain) + 1  # the step away from the object is a motion, too
+    assert until(begin)[: len(remain)] == remain
+    assert len(until(begin)) <= len(remain) + 1  # the step away from the object is a motion, too
 
 
 def test_a_track_that_has_ended_does_not_go_on_where_something_passes():
     images = np.array(SPLIT.images)
     images[10] = images[5]
-    track = only(OBJECT)
-    stuck = track._replace(pixels=np.where((track.frames >= 7)[:, None], track.pixels[5], track.pixels))
-    ended = until_rest(stuck, dataclasses.replace(SPLIT, images=images), backdrop(SPLIT))
-    assert ended.frames.max() <= 7
+    assert max(until(0, dataclasses.replace(SPLIT, images=images))) <= 7
 
 
 def test_of_tracks_that_are_almost_only_background_nothing_remains():
