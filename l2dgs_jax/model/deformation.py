@@ -49,7 +49,7 @@ def deform(
     raw = (gaussians.means, gaussians.quats, gaussians.log_scales, gaussians.logit_opacities)
     means, quats, log_scales, logit_opacities = map(per_view, raw)
     dc_and_rest = jnp.concatenate([gaussians.illumination_dc, gaussians.illumination_rest], axis=-1)
-    coefficients = _active(dc_and_rest, cfg.sh_degree, sh_degree_active)[None]  # b_j of Eq. 2
+    coefficients = per_view(_active(dc_and_rest, cfg.sh_degree, sh_degree_active))  # b_j of Eq. 2
     if moving:
         changes = _changes(scene, gaussians, cameras, cfg)
         means += length_unit(scene.extent, cfg) * changes.motion.means
@@ -73,7 +73,7 @@ def deform(
         quats=quats,
         scales=jnp.exp(log_scales),
         opacities=opacities if presence is None else jnp.minimum(presence[None] * opacities, 1),
-        illumination=jnp.maximum(cfg.illumination_offset + jnp.sum(coefficients * basis, axis=-1), 0),
+        illumination=jnp.maximum(cfg.illumination_offset + jnp.einsum("...j,...j->...", coefficients, basis), 0),
         reflectance=reflectance,
         attenuation=per_view(gaussians.attenuation),
     )
@@ -132,7 +132,15 @@ def _on_paths(
     first, last = jnp.where(follows[:, None], lifetimes, 0).T
     outside = jnp.maximum(first[None] - times[:, None], times[:, None] - last[None])
     visibility = jnp.clip(1 - (knots - 1) / FADE_DURATION * outside, 0, 1)
-    displacements = jnp.einsum("vk,nkc->vnc", path_weights(times, knots), jnp.where(follows[:, None, None], paths, 0))
+    near = min(4, knots)  # control points of non-zero weight at an instant: reading all takes many times as long
+    start = jnp.clip(jnp.floor(_position(times, knots)).astype(jnp.int32) - 1, 0, knots - near)
+
+    def displaced(weights: Float[Array, " K"], start: Int[Array, ""]) -> Float[Array, "N 3"]:
+        points = jnp.where(follows[:, None, None], jax.lax.dynamic_slice_in_dim(paths, start, near, 1), 0)
+        weights = jax.lax.dynamic_slice_in_dim(weights, start, near)
+        return sum(weights[k] * points[:, k] for k in range(near))
+
+    displacements = jax.vmap(displaced)(path_weights(times, knots), start)
     return displacements, jnp.where(follows[None], visibility, 1)
 
 
@@ -143,11 +151,16 @@ def has_path(lifetimes: Float[Array, "N 2"]) -> Bool[Array, " N"]:
 
 def path_weights(times: Float[Array, " V"], knots: int) -> Float[Array, "V K"]:
     """Weights of a path's control points at instants in [0, 1]: a uniform cubic spline. Carries gradients."""
-    position = jnp.clip(times, 0, 1) * (knots - 1)
+    position = _position(times, knots)
     distance = jnp.abs(position[:, None] - jnp.arange(knots, dtype=position.dtype)[None])
     near, far = jnp.minimum(distance, 1), jnp.clip(2 - distance, 0, 1)
     weights = jnp.where(distance < 1, 2 / 3 - near**2 + near**3 / 2, far**3 / 6)
     return weights / weights.sum(-1, keepdims=True)  # at both ends the spline reaches beyond the control points
+
+
+def _position(times: Float[Array, " V"], knots: int) -> Float[Array, " V"]:
+    """Instants in units of the spacing of control points."""
+    return jnp.clip(times, 0, 1) * (knots - 1)
 
 
 def length_unit(extent: Float[Array, ""] | float, cfg: ModelConfig) -> Float[Array, ""] | float:

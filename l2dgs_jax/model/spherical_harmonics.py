@@ -16,9 +16,11 @@ def directions(means: Float[Array, "*B N 3"], camera_centre: Float[Array, "*B 3"
         camera_centre: world units.
     """
     offsets = means - camera_centre[..., None, :]
-    squared = jnp.sum(offsets**2, axis=-1, keepdims=True)
+    # Sums along short axes are contractions, here and in their gradients: on a CPU, XLA's reductions take far longer.
+    squared = jnp.einsum("...i,...i->...", offsets, offsets)
     coincident = squared == 0
-    return jnp.where(coincident, 0, offsets / jnp.sqrt(jnp.where(coincident, 1, squared)))
+    inverse = jnp.where(coincident, 0, 1 / jnp.sqrt(jnp.where(coincident, 1, squared)))
+    return jnp.einsum("...,...i->...i", inverse, offsets)
 
 
 def basis(directions: Float[Array, "*B N 3"], degree: int) -> Float[Array, "*B N J"]:

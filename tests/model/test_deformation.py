@@ -333,10 +333,12 @@ def with_paths(times, paths=PATHS, lifetimes=LIFETIMES):
     return without, deformed(params._replace(gaussians=gaussians), cameras=cameras, moving=False)
 
 
-def test_gaussians_follow_their_paths():
-    times = (0.0, 1 / 3, 0.5, 0.85, 1.0)
-    without, moved = with_paths(times)
-    expected = np.einsum("vk,nkc->vnc", path_weights(jnp.asarray(times), KNOTS), PATHS)
+@pytest.mark.parametrize("knots", [2, 3, 4, 9])
+def test_gaussians_follow_their_paths(knots):
+    times = (0.0, 0.1, 1 / 3, 0.5, 0.85, 0.99, 1.0)
+    paths = np.random.default_rng(3).normal(0, 0.3, (N, knots, 3))
+    without, moved = with_paths(times, paths)
+    expected = np.einsum("vk,nkc->vnc", path_weights(jnp.asarray(times), knots), paths)
     expected = expected * np.isfinite(LIFETIMES[:, :1])
     np.testing.assert_allclose(moved.means - without.means, expected, atol=1e-12)
 
@@ -364,12 +366,15 @@ def test_gaussians_fade_in_and_out_at_the_ends_of_their_lifetimes():
     np.testing.assert_allclose(moved.opacities / without.opacities, expected, atol=1e-9)
 
 
-def test_paths_and_lifetimes_carry_gradients():
+@pytest.mark.parametrize(("knots", "times"), [(KNOTS, (0.15, 0.62)), (9, (0.19, 0.42))])
+def test_paths_and_lifetimes_carry_gradients(knots, times):
+    start = np.random.default_rng(4).normal(0, 0.3, (N, knots, 3))
+
     def total(paths, lifetimes):
-        _, moved = with_paths((0.15, 0.62), paths, jnp.concatenate([lifetimes, jnp.asarray(LIFETIMES[4:])]))
+        _, moved = with_paths(times, paths, jnp.concatenate([lifetimes, jnp.asarray(LIFETIMES[4:])]))
         return jnp.sin(3 * moved.means).sum() + jnp.square(moved.opacities).sum()
 
-    check_grads(total, (PATHS, LIFETIMES[:4]), 1, modes=["rev"])
-    gradient = jax.grad(total, 1)(jnp.asarray(PATHS), jnp.asarray(LIFETIMES[:4]))
+    check_grads(total, (start, LIFETIMES[:4]), 1, modes=["rev"])
+    gradient = jax.grad(total, 1)(jnp.asarray(start), jnp.asarray(LIFETIMES[:4]))
     assert np.isfinite(gradient).all()
     assert np.abs(gradient).max() > 0.1
