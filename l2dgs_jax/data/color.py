@@ -10,17 +10,20 @@ MID_GREY = 0.46  # photographers' middle grey, 18 % of linear light, in sRGB
 AnyArray = TypeVar("AnyArray", Array, np.ndarray)
 
 
+# Powers are taken by logarithms: XLA's own take five times as long on a CPU.
+
+
 def srgb_to_linear(value: AnyArray) -> AnyArray:
     """Inverse of the sRGB transfer function (IEC 61966-2-1), for values [*S] in [0, 1]."""
-    where = value.__array_namespace__().where
-    return where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
+    xp = value.__array_namespace__()
+    return xp.where(value <= 0.04045, value / 12.92, xp.exp(2.4 * xp.log((value + 0.055) / 1.055)))
 
 
 def linear_to_srgb(value: AnyArray) -> AnyArray:
     """The sRGB transfer function (IEC 61966-2-1), for values [*S] >= 0."""
-    where = value.__array_namespace__().where
+    xp = value.__array_namespace__()
     low = value <= 0.0031308  # includes 0, where the gradient of the power is not finite
-    return where(low, value * 12.92, 1.055 * where(low, 1, value) ** (1 / 2.4) - 0.055)
+    return xp.where(low, value * 12.92, 1.055 * xp.exp(xp.log(xp.where(low, 1, value)) / 2.4) - 0.055)
 
 
 def brightening_exponent(mean: float, target: float) -> float:

@@ -138,7 +138,7 @@ def _on_paths(
     def displaced(weights: Float[Array, " K"], start: Int[Array, ""]) -> Float[Array, "N 3"]:
         points = jnp.where(follows[:, None, None], jax.lax.dynamic_slice_in_dim(paths, start, near, 1), 0)
         weights = jax.lax.dynamic_slice_in_dim(weights, start, near)
-        return sum(weights[k] * points[:, k] for k in range(near))
+        return sum((weights[k] * points[:, k] for k in range(near)), jnp.zeros_like(points[:, 0]))
 
     displacements = jax.vmap(displaced)(path_weights(times, knots), start)
     return displacements, jnp.where(follows[None], visibility, 1)
