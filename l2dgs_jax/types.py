@@ -34,8 +34,8 @@ class Gaussians(NamedTuple):
         reflectance: r of Eq. 6.
         attenuation: brightness attenuation features (b1, b2) of Eq. 8.
         gate: logit of a factor in (0, 1) on all that the motion field does to a Gaussian; None: no gates, factor 1.
-        paths: displacements, as K control points of a cubic spline over [0, 1], world units; None: no Gaussian has one.
-        lifetimes: first and last instant at which a Gaussian with a path is visible; infinite for those without a path.
+        lifetimes: first and last instant at which a Gaussian with a path is visible; infinite for those without a path;
+            None: no Gaussian has one.
         color_rest: SH coefficients 2 ... J of the colour, of which `reflectance` is the constant part, in scenes
             without a decomposition; None in the others.
     """
@@ -49,7 +49,6 @@ class Gaussians(NamedTuple):
     reflectance: Float[Array, "*B N 3"]
     attenuation: Float[Array, "*B N 2"]
     gate: Float[Array, "*B N"] | None = None
-    paths: Float[Array, "*B N K 3"] | None = None
     lifetimes: Float[Array, "*B N 2"] | None = None
     color_rest: Float[Array, "*B N 3 J1"] | None = None
 
@@ -165,6 +164,8 @@ class SceneParams(NamedTuple):
     The last two fields describe the training frames, not the scene.
 
     Attributes:
+        paths: P displacements over time that Gaussians follow, each as K control points of a cubic spline over [0, 1],
+            world units; None: no Gaussian has a path.
         exposures: logarithms of the gains of every training frame's colour channels, not used for rendering; None if
             the camera's exposure is taken to be constant.
         curves: how the frames became dark, in scenes whose low-light image is a tone curve of the well-lit one; None
@@ -176,6 +177,7 @@ class SceneParams(NamedTuple):
     heads: MotionHeads
     ocd: OCDNet
     bafe: BAFENet
+    paths: Float[Array, "*B P K 3"] | None = None
     exposures: Float[Array, "*B F 3"] | None = None
     curves: ToneCurves | None = None
 
@@ -188,12 +190,14 @@ class Scene(NamedTuple):
         alive: which Gaussians exist.
         bounds: lowest and highest corner of the HexPlane's box, world units, not learned.
         extent: the length that learning rates of positions scale with, world units (`ModelConfig.unit`).
+        path_of: the row of `params.paths` that each Gaussian of finite lifetime follows; None if there are no paths.
     """
 
     params: SceneParams
     alive: Bool[Array, "*B N"]
     bounds: Float[Array, "*B 2 3"]
     extent: Float[Array, "*B"]
+    path_of: Int[Array, "*B N"] | None = None
 
 
 class RasterOutput(NamedTuple):

@@ -81,15 +81,16 @@ def fine_state(dataset: Dataset, config: Config, moving_share: float = 1.0) -> T
         log_scales=rows(jnp.log(arrays["scales"])),
         logit_opacities=rows(logit(arrays["opacities"])),
     )
+    still = np.random.default_rng(2).uniform(size=count) >= moving_share
+    paths = path_of = None
     if config.model.tracks:
-        gaussians = gaussians._replace(
-            paths=rows(jnp.zeros((count, path_knots(frames), 3))),
-            lifetimes=rows(jnp.tile(jnp.array([0.0, 1.0]), (count, 1))),
-        )
+        lifetimes = np.where(still[:, None], [-np.inf, np.inf], [0.0, 1.0])
+        gaussians = gaussians._replace(lifetimes=rows(jnp.asarray(lifetimes, float)))
+        paths = jnp.zeros((count - still.sum(), path_knots(frames), 3))
+        path_of = rows(jnp.asarray(np.maximum(np.cumsum(~still) - 1, 0), jnp.int32))
     if gaussians.gate is not None:
-        shut = np.random.default_rng(2).uniform(size=gaussians.gate.shape) >= moving_share
-        gaussians = gaussians._replace(gate=jnp.where(shut, -np.inf, gaussians.gate))
-    scene = scene._replace(params=scene.params._replace(gaussians=gaussians))
+        gaussians = gaussians._replace(gate=jnp.where(rows(jnp.asarray(still)), -np.inf, gaussians.gate))
+    scene = scene._replace(params=scene.params._replace(gaussians=gaussians, paths=paths), path_of=path_of)
     return begin_stage(scene, jnp.asarray(config.coarse_steps, jnp.int32), config, config.fine_steps)
 
 

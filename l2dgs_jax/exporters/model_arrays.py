@@ -9,7 +9,7 @@ from jaxtyping import Shaped
 from l2dgs_jax.data.dataset import Split
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.model.decomposition import full_light
-from l2dgs_jax.model.deformation import length_unit, openness
+from l2dgs_jax.model.deformation import has_path, length_unit, openness
 from l2dgs_jax.rasterizer.projection import NEAR_PLANE
 from l2dgs_jax.runs import Run
 
@@ -28,6 +28,9 @@ def model_arrays(run: Run) -> dict[str, Shaped[np.ndarray, "..."]]:
             raise UserError(f"{run.name}: model.{name} is {getattr(cfg, name)}; expected {required} for this format")
     params, alive = scene.params, np.asarray(scene.alive)
     gaussians = {name: rows for name, rows in params.gaussians._asdict().items() if rows is not None}
+    if params.paths is not None:
+        follows = np.asarray(has_path(gaussians["lifetimes"]))
+        gaussians["paths"] = np.where(follows[:, None, None], np.asarray(params.paths)[scene.path_of], 0)
     if "gate" in gaussians:
         gaussians["gate"] = np.where(openness(gaussians["gate"], cfg) > 0, gaussians["gate"], -np.inf)
     coefficients = [gaussians.pop("illumination_dc"), gaussians.pop("illumination_rest")]

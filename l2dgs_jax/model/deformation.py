@@ -60,8 +60,8 @@ def deform(
         if changes.light is not None:
             coefficients = (1 + changes.light) * coefficients
     opacities = jnp.where(alive[None], jax.nn.sigmoid(logit_opacities), 0)
-    if gaussians.paths is not None and gaussians.lifetimes is not None:
-        displacements, visibility = _on_paths(gaussians.paths, gaussians.lifetimes, cameras.time)
+    if params.paths is not None and scene.path_of is not None and gaussians.lifetimes is not None:
+        displacements, visibility = _on_paths(params.paths, scene.path_of, gaussians.lifetimes, cameras.time)
         means, opacities = means + displacements, visibility * opacities
     basis = _basis(gaussians.means, cameras.viewmat, cfg.sh_degree)
     reflectance = per_view(gaussians.reflectance)
@@ -120,12 +120,15 @@ def _growth(log_scales: Float[Array, "V N 3"], cfg: ModelConfig) -> Float[Array,
 
 
 def _on_paths(
-    paths: Float[Array, "N K 3"], lifetimes: Float[Array, "N 2"], times: Float[Array, " V"]
+    paths: Float[Array, "P K 3"],
+    path_of: Int[Array, " N"],
+    lifetimes: Float[Array, "N 2"],
+    times: Float[Array, " V"],
 ) -> tuple[Float[Array, "V N 3"], Float[Array, "V N"]]:
     """Displacements of Gaussians along their paths, and the factors by which lifetimes scale their opacities.
 
-    Outside its lifetime a Gaussian fades within `FADE_DURATION`. Gradients flow to all arguments; Gaussians of infinite
-    lifetime have no path: they stay in place, with a factor of 1.
+    Outside its lifetime a Gaussian fades within `FADE_DURATION`. Gaussians of infinite lifetime have no path: they stay
+    in place, with a factor of 1. Gradients flow to paths, lifetimes and times.
     """
     knots = paths.shape[1]
     follows = has_path(lifetimes)
@@ -135,13 +138,13 @@ def _on_paths(
     near = min(4, knots)  # control points of non-zero weight at an instant: reading all takes many times as long
     start = jnp.clip(jnp.floor(_position(times, knots)).astype(jnp.int32) - 1, 0, knots - near)
 
-    def displaced(weights: Float[Array, " K"], start: Int[Array, ""]) -> Float[Array, "N 3"]:
-        points = jnp.where(follows[:, None, None], jax.lax.dynamic_slice_in_dim(paths, start, near, 1), 0)
+    def displaced(weights: Float[Array, " K"], start: Int[Array, ""]) -> Float[Array, "P 3"]:
+        points = jax.lax.dynamic_slice_in_dim(paths, start, near, 1)
         weights = jax.lax.dynamic_slice_in_dim(weights, start, near)
         return sum((weights[k] * points[:, k] for k in range(near)), jnp.zeros_like(points[:, 0]))
 
-    displacements = jax.vmap(displaced)(path_weights(times, knots), start)
-    return displacements, jnp.where(follows[None], visibility, 1)
+    displacements = jax.vmap(displaced)(path_weights(times, knots), start)[:, path_of]
+    return jnp.where(follows[None, :, None], displacements, 0), jnp.where(follows[None], visibility, 1)
 
 
 def has_path(lifetimes: Float[Array, "N 2"]) -> Bool[Array, " N"]:

@@ -14,8 +14,9 @@ from scipy.special import logit
 from l2dgs_jax.cameras.geometry import camera_extent, median_depth
 from l2dgs_jax.config import ModelConfig
 from l2dgs_jax.model import hexplane, networks
-from l2dgs_jax.model.deformation import length_unit
+from l2dgs_jax.model.deformation import has_path, length_unit
 from l2dgs_jax.model.tone_curves import RAMPS
+from l2dgs_jax.runtime.capacity import next_capacity
 from l2dgs_jax.types import Camera, Gaussians, Scene, SceneParams, ToneCurves
 
 SH_DC = 0.28209479177387814  # value of the first SH basis function
@@ -98,7 +99,8 @@ def initialise(
     paths = lifetimes = None
     if seeds is not None:
         num_static = len(points)
-        paths = np.concatenate([np.zeros((num_static, *seeds.paths.shape[1:])), seeds.paths])
+        unused = next_capacity(len(seeds.paths)) - len(seeds.paths)  # scenes of like sizes share compiled programs
+        paths = np.pad(seeds.paths, [(0, unused), (0, 0), (0, 0)])
         lifetimes = np.concatenate([np.tile([[-np.inf, np.inf]], (num_static, 1)), seeds.lifetimes])
         mean_square = np.concatenate([mean_square, np.square(SEED_SCALE * seeds.spacings)])
         points = np.concatenate([points, seeds.points])
@@ -175,14 +177,17 @@ def _initialise(
     extent: Float[Array, ""],
     exposures: Float[Array, "F 3"] | None,
     curve: Float[Array, " R"] | None,
-    paths: Float[Array, "P K 3"] | None = None,
+    paths: Float[Array, "S K 3"] | None = None,
     lifetimes: Float[Array, "P 2"] | None = None,
     *,
     cfg: ModelConfig,
     num_frames: int,
     capacity: int,
 ) -> Scene:
-    """See `initialise`; `illumination` is what the spherical harmonics are to give, without their offset."""
+    """See `initialise`; `illumination` is what the spherical harmonics are to give, without their offset.
+
+    The Gaussians of finite lifetime, which come last, follow the paths one by one.
+    """
     count, num_rest = len(points), (cfg.sh_degree + 1) ** 2 - 1
     keys = jax.random.split(key, 6)
     random = {"normal": jax.random.normal, "uniform": jax.random.uniform}
@@ -196,10 +201,12 @@ def _initialise(
         reflectance=random[cfg.reflectance_init](keys[0], (count, 3)) if reflectance is None else reflectance,
         attenuation=random[cfg.attenuation_init](keys[1], (count, 2)),
         gate=jnp.full(count, INITIAL_GATE, float) if cfg.motion_gate else None,
-        paths=paths,
         lifetimes=lifetimes,
         color_rest=jnp.zeros((count, 3, num_rest)) if cfg.decomposition != "retinex" else None,
     )
+    path_of = None
+    if lifetimes is not None:
+        path_of = jnp.maximum(jnp.cumsum(has_path(lifetimes)) - 1, 0).astype(jnp.int32)
     curves = None
     if cfg.decomposition == "curve" and curve is not None:
         curves = ToneCurves(curve, jnp.zeros((num_frames, RAMPS)))
@@ -209,6 +216,7 @@ def _initialise(
         heads=networks.init_heads(keys[3], cfg.plane_channels * len(cfg.plane_scales), cfg),
         ocd=networks.init_ocd(keys[4], cfg),
         bafe=networks.init_bafe(keys[5], exponent_bias),
+        paths=paths,
         exposures=exposures if cfg.exposure == "drifting" else None,
         curves=curves,
     )
@@ -217,6 +225,7 @@ def _initialise(
         alive=jnp.arange(capacity) < count,
         bounds=bounds,
         extent=extent,
+        path_of=None if path_of is None else pad_rows(path_of, capacity),
     )
 
 

@@ -22,8 +22,9 @@ from l2dgs_jax.runtime.files import flush, replacing
 from l2dgs_jax.training.initial_state import state_shapes
 from l2dgs_jax.training.state import TrainState
 
-_STEP = ".step"  # name of the array in a file that holds `TrainState.step`
-VERSION = 2  # of the file format; files of version 1 have no version and no halvings
+_STEP, _ALIVE, _PATH_OF = ".step", ".scene.alive", ".scene.path_of"  # names of arrays in a file, by their place
+# Of the file format: files of version 1 have no version and no halvings; before 3, each Gaussian had a path of its own.
+VERSION = 3
 
 # Exceptions that reading zip, npy and JSON raises for damaged files.
 DAMAGE_ERRORS = (
@@ -156,12 +157,16 @@ def load(path: Path, config: Config, num_frames: int) -> Checkpoint:
                     f"{path}: of version {version}; expected at most {VERSION}: a newer l2dgs_jax has written it"
                 )
             check_settings(path, from_dict(header["config"]), config)
-            misfit = next((name for name, leaf in expected.items() if not _fits(archive, name, leaf)), None)
+            sources = {name: name for name in expected}
+            if version < 3:
+                sources = {name: name.replace(".paths", ".gaussians.paths") for name in expected if name != _PATH_OF}
+            misfit = next((name for name in sources if not _fits(archive, sources[name], expected[name])), None)
             if misfit:
                 raise UserError(
                     f"{path}: the array {misfit} is missing or has another shape; expected a checkpoint of this run"
                 )
-            arrays = (jnp.asarray(_read(archive, name)) for name in expected)
+            own = lambda: np.arange(len(_read(archive, _ALIVE)), dtype=np.int32)  # each Gaussian's path
+            arrays = (jnp.asarray(_read(archive, sources[name]) if name in sources else own()) for name in expected)
             state = jax.tree_util.tree_unflatten(treedef, arrays)
             return Checkpoint(state, header["pair_capacity"], header.get("halvings", 0))
     except FileNotFoundError:

@@ -31,6 +31,7 @@ class Densified(NamedTuple):
         gaussians: rows after cloning and splitting.
         alive: which rows exist.
         changed: rows that were written or died: their optimizer state and statistics start anew.
+        source: the row that each row is a copy of; its own if it is none.
         wanted: free rows that were needed.
         missing: how many of these were lacking; if any, the caller grows the capacity and calls again.
     """
@@ -38,6 +39,7 @@ class Densified(NamedTuple):
     gaussians: Gaussians
     alive: Bool[Array, " N"]
     changed: Bool[Array, " N"]
+    source: Int[Array, " N"]
     wanted: Int[Array, ""]
     missing: Int[Array, ""]
 
@@ -109,10 +111,12 @@ def densify(
     first, second = (_sample(gaussians, split, k) for k in jax.random.split(key))
     written = jax.tree.map(lambda old, new: old.at[target].set(new, mode="drop"), first, second)
     born = jnp.zeros(capacity, bool).at[target].set(True, mode="drop")
+    rows = jnp.arange(capacity, dtype=jnp.int32)
     return Densified(
         gaussians=written,
         alive=alive_kept | born,
         changed=pruned | born | (chosen if cfg.conserve_opacity else split),
+        source=rows.at[target].set(rows, mode="drop"),
         wanted=wanted,
         missing=jnp.maximum(wanted - free, 0),
     )

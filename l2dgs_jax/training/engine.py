@@ -245,9 +245,10 @@ def _stack(trees: Sequence[T]) -> T:
 
 
 def _stack_states(states: Sequence[TrainState]) -> TrainState:
-    """States stacked in new buffers, with as many rows as the largest has."""
+    """States stacked in new buffers, with as many rows and paths as the largest has."""
     capacity = max(len(state.scene.alive) for state in states)
-    return jax.tree.map(lambda *x: jnp.stack(x), *[with_capacity(state, capacity) for state in states])
+    paths = max(0 if state.scene.params.paths is None else len(state.scene.params.paths) for state in states)
+    return jax.tree.map(lambda *x: jnp.stack(x), *[with_capacity(state, capacity, paths) for state in states])
 
 
 def _complaint(report: StepReport, step: int) -> str:

@@ -20,7 +20,6 @@ GAUSSIAN_GROUPS: dict[str, Any] = {
     "reflectance": "reflectance",
     "attenuation": "attenuation",
     "gate": "gate",
-    "paths": "paths",
     "lifetimes": "lifetimes",
     "color_rest": "illumination_rest",
 }
@@ -39,6 +38,7 @@ def groups(params: SceneParams) -> SceneParams:
         heads=label("heads", params.heads),
         ocd=label("ocd", params.ocd),
         bafe=label("bafe", params.bafe),
+        paths=label("paths", params.paths),
         exposures=label("exposures", params.exposures),
         curves=label("curves", params.curves),
     )

@@ -85,6 +85,7 @@ def relocate(
         gaussians=_spread_copies(copied, take, filled | split, jax.random.fold_in(key, 1), spread),
         alive=alive | (born & filled),
         changed=filled | split,
+        source=take,
         wanted=jnp.zeros_like(count),
         missing=jnp.zeros_like(count),
     )

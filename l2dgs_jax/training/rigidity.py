@@ -48,7 +48,11 @@ def rigidity(scene: Scene, cfg: ModelConfig, key: PRNGKeyArray) -> Float[Array, 
     drawn = jax.tree.map(lambda values: compaction.select(values, subset, 0), gaussians)
     anywhere = lambda size: jnp.broadcast_to(jnp.eye(size, dtype=dtype), (2, size, size))
     moved = deform(
-        scene._replace(params=scene.params._replace(gaussians=drawn), alive=scene.alive[subset.rows]),
+        scene._replace(
+            params=scene.params._replace(gaussians=drawn),
+            alive=scene.alive[subset.rows],
+            path_of=None if scene.path_of is None else scene.path_of[subset.rows],
+        ),
         Camera(anywhere(4), anywhere(3), instants),  # motion does not depend on where the camera is
         cfg,
         moving=True,

@@ -66,12 +66,24 @@ def randomness(state: TrainState, config: Config) -> PRNGKeyArray:
     return jax.random.fold_in(jax.random.key(config.seed), state.step)
 
 
-def with_capacity(state: TrainState, capacity: int) -> TrainState:
-    """The same state with dead rows appended up to `capacity`."""
+def with_capacity(state: TrainState, capacity: int, path_capacity: int | None = None) -> TrainState:
+    """The same state with dead rows appended up to `capacity`, and unused paths up to `path_capacity`."""
     pad = partial(pad_rows, capacity=capacity)
+
+    def padded(params: SceneParams) -> SceneParams:
+        paths = params.paths
+        if paths is not None and path_capacity is not None:
+            paths = pad_rows(paths, path_capacity)
+        return map_gaussians(pad, params)._replace(paths=paths)
+
+    scene = state.scene
     return TrainState(
-        scene=state.scene._replace(params=map_gaussians(pad, state.scene.params), alive=pad(state.scene.alive)),
-        adam=state.adam._replace(mu=map_gaussians(pad, state.adam.mu), nu=map_gaussians(pad, state.adam.nu)),
+        scene=scene._replace(
+            params=padded(scene.params),
+            alive=pad(scene.alive),
+            path_of=None if scene.path_of is None else pad(scene.path_of),
+        ),
+        adam=state.adam._replace(mu=padded(state.adam.mu), nu=padded(state.adam.nu)),
         stats=jax.tree.map(pad, state.stats),
         step=state.step,
     )

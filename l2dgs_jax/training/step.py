@@ -145,7 +145,11 @@ def densify(state: TrainState, config: Config, growths_left: Int[Array, ""] | in
         return jnp.where(result.changed.reshape(-1, *[1] * (rows.ndim - 1)), 0, rows)
 
     grown = TrainState(
-        scene=scene._replace(params=scene.params._replace(gaussians=result.gaussians), alive=result.alive),
+        scene=scene._replace(
+            params=scene.params._replace(gaussians=result.gaussians),
+            alive=result.alive,
+            path_of=None if scene.path_of is None else scene.path_of[result.source],
+        ),
         adam=state.adam._replace(mu=map_gaussians(reset, state.adam.mu), nu=map_gaussians(reset, state.adam.nu)),
         stats=jax.tree.map(jnp.zeros_like, state.stats),
         step=state.step,

@@ -71,11 +71,11 @@ def test_the_documented_program_renders_the_model(run, variant, tmp_path, monkey
     lifetimes = np.where(np.arange(count)[:, None] % 3 > 0, [-np.inf, np.inf], [0.1, 0.9])
     gaussians = run.state.scene.params.gaussians._replace(
         gate=jnp.asarray(rng.normal(0, 1, count)),
-        paths=jnp.asarray(rng.normal(0, 0.05, (count, 5, 3))),
         lifetimes=jnp.asarray(lifetimes),
     )
-    params = params._replace(gaussians=gaussians)
-    state = run.state._replace(scene=run.state.scene._replace(params=params))
+    params = params._replace(gaussians=gaussians, paths=jnp.asarray(rng.normal(0, 0.05, (7, 5, 3))))
+    path_of = jnp.asarray(rng.integers(7, size=count))
+    state = run.state._replace(scene=run.state.scene._replace(params=params, path_of=path_of))
     model = dataclasses.replace(run.config.model, **variant)
     run = dataclasses.replace(run, state=state, config=dataclasses.replace(run.config, model=model))
     monkeypatch.chdir(tmp_path)

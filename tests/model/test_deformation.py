@@ -23,7 +23,8 @@ N = 6
 
 @partial(jax.jit, static_argnames=("cfg", "moving"))
 def deform_jit(params, cameras, alive, bounds, cfg, extent=1.0, **options):
-    return deform(Scene(params, alive, bounds, jnp.asarray(extent)), cameras, cfg, **options)
+    path_of = options.pop("path_of", None)
+    return deform(Scene(params, alive, bounds, jnp.asarray(extent), path_of), cameras, cfg, **options)
 
 
 @partial(jax.jit, static_argnums=2)
@@ -322,23 +323,25 @@ def test_single_precision_is_kept():
 
 KNOTS = 4
 LIFETIMES = np.array([[0, 1], [0.2, 0.7], [-1, 0.4], [0.8, 0.9], [-np.inf, np.inf], [-np.inf, np.inf]])
-PATHS = np.random.default_rng(2).normal(0, 0.3, (N, KNOTS, 3))
+PATH_OF = np.array([2, 0, 1, 0, 0, 2], np.int32)  # two Gaussians share a path; the last two follow none
+PATHS = np.random.default_rng(2).normal(0, 0.3, (3, KNOTS, 3))
 
 
 def with_paths(times, paths=PATHS, lifetimes=LIFETIMES):
     """The Gaussians without and with paths and lifetimes."""
     params, cameras = random_params(), views(times=times)
-    gaussians = params.gaussians._replace(paths=jnp.asarray(paths), lifetimes=jnp.asarray(lifetimes))
+    gaussians = params.gaussians._replace(lifetimes=jnp.asarray(lifetimes))
+    followed = params._replace(gaussians=gaussians, paths=jnp.asarray(paths))
     without = deformed(params, cameras=cameras, moving=False)
-    return without, deformed(params._replace(gaussians=gaussians), cameras=cameras, moving=False)
+    return without, deformed(followed, cameras=cameras, moving=False, path_of=jnp.asarray(PATH_OF))
 
 
 @pytest.mark.parametrize("knots", [2, 3, 4, 9])
 def test_gaussians_follow_their_paths(knots):
     times = (0.0, 0.1, 1 / 3, 0.5, 0.85, 0.99, 1.0)
-    paths = np.random.default_rng(3).normal(0, 0.3, (N, knots, 3))
+    paths = np.random.default_rng(3).normal(0, 0.3, (3, knots, 3))
     without, moved = with_paths(times, paths)
-    expected = np.einsum("vk,nkc->vnc", path_weights(jnp.asarray(times), knots), paths)
+    expected = np.einsum("vk,nkc->vnc", path_weights(jnp.asarray(times), knots), paths[PATH_OF])
     expected = expected * np.isfinite(LIFETIMES[:, :1])
     np.testing.assert_allclose(moved.means - without.means, expected, atol=1e-12)
 
@@ -368,7 +371,7 @@ def test_gaussians_fade_in_and_out_at_the_ends_of_their_lifetimes():
 
 @pytest.mark.parametrize(("knots", "times"), [(KNOTS, (0.15, 0.62)), (9, (0.19, 0.42))])
 def test_paths_and_lifetimes_carry_gradients(knots, times):
-    start = np.random.default_rng(4).normal(0, 0.3, (N, knots, 3))
+    start = np.random.default_rng(4).normal(0, 0.3, (3, knots, 3))
 
     def total(paths, lifetimes):
         _, moved = with_paths(times, paths, jnp.concatenate([lifetimes, jnp.asarray(LIFETIMES[4:])]))

@@ -110,7 +110,7 @@ def test_older_versions_are_read_and_later_ones_refused(dataset, tmp_path):
     assert old[1:] == (64, 0)
     assert_equal_states(old.state, state)
     rewrite_header(path, version=checkpoints.VERSION + 1, config={"nonsuch": 1})
-    with pytest.raises(UserError, match=r"npz: of version 3; expected at most 2") as caught:
+    with pytest.raises(UserError, match=r"npz: of version 4; expected at most 3") as caught:
         checkpoints.load(path, config, FRAMES)
     assert not isinstance(caught.value, checkpoints.DamagedError)
 

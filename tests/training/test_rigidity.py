@@ -144,7 +144,8 @@ def test_gaussians_on_paths_are_drawn_as_if_their_gates_were_open_while_they_liv
     on_path = scene.alive & (number % 2 == 0)  # these have closed gates
     lifetime = jnp.where((number % 4 == 0)[:, None], jnp.array([0.0, 0.5]), jnp.array([0.5, 1.0]))
     lifetimes = jnp.where(on_path[:, None], lifetime, jnp.array([-jnp.inf, jnp.inf]))
-    tracked = with_gaussians(scene, paths=jnp.zeros((rows, 4, 3)), lifetimes=lifetimes)
+    params = with_gaussians(scene, lifetimes=lifetimes).params._replace(paths=jnp.zeros((1, 4, 3)))
+    tracked = scene._replace(params=params, path_of=jnp.zeros(rows, int))
     monkeypatch.setattr(module, "DRAWN", int(scene.alive.sum()) // 3)
     shares = []
     for seed in range(12):

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import json
 import sys
 
 import cv2
@@ -19,8 +20,10 @@ from l2dgs_jax.model.deformation import path_weights
 from l2dgs_jax.model.initialisation import Seeds, path_knots
 from l2dgs_jax.runs import checkpoints
 from l2dgs_jax.runs.checkpoints import Checkpoint
-from l2dgs_jax.training import initial_state, relocation
+from l2dgs_jax.training import initial_state
 from l2dgs_jax.training.seeds import find_seeds
+from l2dgs_jax.training.state import with_capacity
+from l2dgs_jax.training.step import densify
 from l2dgs_jax.types import Camera
 
 COUNT, MANY = 14, 10_000
@@ -197,7 +200,7 @@ def test_a_training_starts_with_the_seeds_after_the_points(tracked):
     gaussians = jax.tree.map(lambda rows: np.asarray(rows)[points : points + 2], scene.params.gaussians)
     assert int(scene.alive.sum()) == points + 2
     np.testing.assert_allclose(gaussians.means, TWO_SEEDS.points)
-    np.testing.assert_allclose(gaussians.paths, TWO_SEEDS.paths)
+    np.testing.assert_allclose(scene.params.paths[scene.path_of[points : points + 2]], TWO_SEEDS.paths)
     np.testing.assert_allclose(gaussians.lifetimes, TWO_SEEDS.lifetimes)
     first, second = gaussians.reflectance
     assert first[0] < second[0]
@@ -219,18 +222,41 @@ def test_only_seeds_learn_their_paths(tracked):
     config, start = tracked
     end = state_of(finish(make_dataset(), config, start)).scene
     points = len(make_dataset().points)
-    before, after = (np.asarray(scene.params.gaussians.paths)[: points + 2] for scene in (start.scene, end))
+    before, after = (np.asarray(scene.params.paths) for scene in (start.scene, end))
     moved = np.abs(after - before).max((1, 2))
-    assert not moved[:points].any()
-    assert (moved[points:] > 0).all()
+    assert (moved[:2] > 0).all()
+    assert not moved[2:].any()
+    assert np.isinf(end.params.gaussians.lifetimes[:points]).all()
 
 
-def test_paths_are_copied_at_births_and_saved_in_checkpoints(tracked, tmp_path):
+def test_paths_are_shared_at_births_and_saved_in_checkpoints(tracked, tmp_path):
     config, state = tracked
-    gaussians, alive = state.scene.params.gaussians, state.scene.alive
-    born = relocation.relocate(gaussians, alive, alive.sum() + 8, jax.random.key(0), 0.0)
-    rows = np.asarray(born.alive)
-    for path, life in zip(born.gaussians.paths[rows], born.gaussians.lifetimes[rows], strict=True):
-        assert np.isinf(life).all() != bool(np.abs(path).any())
-    checkpoints.save(tmp_path / "checkpoint.npz", Checkpoint(state, 64), config)
-    assert_equal_states(checkpoints.load(tmp_path / "checkpoint.npz", config, FRAMES).state, state)
+    rows = 2 * len(state.scene.alive)
+    config = overrides.replace(config, {"density.method": "mcmc", "density.max_gaussians": rows})
+    state = with_capacity(state, rows)
+    grown, missing = densify(state, config, 1)
+    assert missing == 0
+    lifetimes, path_of = np.asarray(grown.scene.params.gaussians.lifetimes), np.asarray(grown.scene.path_of)
+    followed = path_of[np.asarray(grown.scene.alive) & np.isfinite(lifetimes).all(-1)]
+    assert len(followed) > 2
+    for row, own in enumerate(path_of):
+        if np.isfinite(lifetimes[row]).all() and grown.scene.alive[row]:
+            np.testing.assert_array_equal(lifetimes[row], TWO_SEEDS.lifetimes[own])
+    checkpoints.save(tmp_path / "checkpoint.npz", Checkpoint(grown, 64), config)
+    assert_equal_states(checkpoints.load(tmp_path / "checkpoint.npz", config, FRAMES).state, grown)
+
+
+def test_checkpoints_in_which_each_gaussian_has_a_path_of_its_own_are_read(tracked, tmp_path):
+    """As versions before shared paths wrote them."""
+    config, state = tracked
+    path = tmp_path / "checkpoint.npz"
+    checkpoints.save(path, Checkpoint(state, 64), config)
+    with np.load(path) as file:
+        arrays = dict(file)
+    path_of = arrays.pop(".scene.path_of")
+    for part in (".scene.params", ".adam.mu", ".adam.nu"):
+        arrays[f"{part}.gaussians.paths"] = arrays.pop(f"{part}.paths")[path_of]
+    arrays["header"] = np.array(json.dumps(json.loads(str(arrays["header"])) | {"version": 2}))
+    np.savez(path, **arrays)
+    scene = checkpoints.load(path, config, FRAMES).state.scene
+    np.testing.assert_array_equal(scene.params.paths[scene.path_of], state.scene.params.paths[path_of])
