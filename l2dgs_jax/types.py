@@ -190,7 +190,8 @@ class Scene(NamedTuple):
         alive: which Gaussians exist.
         bounds: lowest and highest corner of the HexPlane's box, world units, not learned.
         extent: the length that learning rates of positions scale with, world units (`ModelConfig.unit`).
-        path_of: the row of `params.paths` that each Gaussian of finite lifetime follows; None if there are no paths.
+        path_of: the row of `params.paths` that each Gaussian of finite lifetime follows, and any other row for the
+            others; None if there are no paths.
     """
 
     params: SceneParams

@@ -10,11 +10,14 @@ from l2dgs_jax.config import Config, overrides
 from l2dgs_jax.data.dataset import Dataset, Split
 from l2dgs_jax.data.stacks import stacked
 from l2dgs_jax.model.initialisation import pad_rows, path_knots
+from l2dgs_jax.runtime.capacity import next_capacity
 from l2dgs_jax.training import initial_state
 from l2dgs_jax.training.batching import load_batch
 from l2dgs_jax.training.state import Batch, TrainState
 from l2dgs_jax.training.step import begin_stage
 from l2dgs_jax.types import Camera
+
+PATH_SHARE = 0.1  # of the Gaussians follow a path
 
 
 def cloud(count: int, width: int, height: int, *, channels: int = 6, seed: int = 0) -> dict[str, np.ndarray]:
@@ -68,7 +71,8 @@ def video(count: int, width: int, height: int, frames: int, *, in_file: bool = F
 def fine_state(dataset: Dataset, config: Config, moving_share: float = 1.0) -> TrainState:
     """The state at the start of the fine stage, with the `cloud` of a `video` as Gaussians and paths without motion.
 
-    If there are motion gates, those of all but `moving_share` of the Gaussians, drawn at random, are shut.
+    If there are motion gates, those of all but `moving_share` of the Gaussians, drawn at random, are shut. With
+    `model.tracks`, a part of the Gaussians follow paths.
     """
     count, frames = len(dataset.points), len(dataset.train.names)
     arrays = cloud(count, dataset.width, dataset.height)
@@ -81,15 +85,15 @@ def fine_state(dataset: Dataset, config: Config, moving_share: float = 1.0) -> T
         log_scales=rows(jnp.log(arrays["scales"])),
         logit_opacities=rows(logit(arrays["opacities"])),
     )
-    still = np.random.default_rng(2).uniform(size=count) >= moving_share
+    drawn = np.random.default_rng(2).uniform(size=len(scene.alive))
     paths = path_of = None
     if config.model.tracks:
-        lifetimes = np.where(still[:, None], [-np.inf, np.inf], [0.0, 1.0])
-        gaussians = gaussians._replace(lifetimes=rows(jnp.asarray(lifetimes, float)))
-        paths = jnp.zeros((count - still.sum(), path_knots(frames), 3))
-        path_of = rows(jnp.asarray(np.maximum(np.cumsum(~still) - 1, 0), jnp.int32))
+        lifetimes = np.where(drawn[:, None] < PATH_SHARE, [0.0, 1.0], [-np.inf, np.inf])
+        gaussians = gaussians._replace(lifetimes=jnp.asarray(lifetimes, float))
+        paths = jnp.zeros((next_capacity(PATH_SHARE * count), path_knots(frames), 3))
+        path_of = jnp.arange(len(drawn), dtype=jnp.int32) % len(paths)
     if gaussians.gate is not None:
-        gaussians = gaussians._replace(gate=jnp.where(rows(jnp.asarray(still)), -np.inf, gaussians.gate))
+        gaussians = gaussians._replace(gate=jnp.where(drawn >= moving_share, -np.inf, gaussians.gate))
     scene = scene._replace(params=scene.params._replace(gaussians=gaussians, paths=paths), path_of=path_of)
     return begin_stage(scene, jnp.asarray(config.coarse_steps, jnp.int32), config, config.fine_steps)
 

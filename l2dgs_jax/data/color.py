@@ -1,4 +1,7 @@
-"""The sRGB transfer function and its inverse, for NumPy and jax arrays, and how much to brighten sRGB values."""
+"""The sRGB transfer function and its inverse, for NumPy and jax arrays, and how much to brighten sRGB values.
+
+Powers are taken by logarithms, because XLA's own take five times as long on a CPU.
+"""
 
 from typing import TypeVar
 
@@ -8,9 +11,6 @@ from jaxtyping import Array
 MID_GREY = 0.46  # photographers' middle grey, 18 % of linear light, in sRGB
 
 AnyArray = TypeVar("AnyArray", Array, np.ndarray)
-
-
-# Powers are taken by logarithms: XLA's own take five times as long on a CPU.
 
 
 def srgb_to_linear(value: AnyArray) -> AnyArray:

@@ -28,16 +28,17 @@ def model_arrays(run: Run) -> dict[str, Shaped[np.ndarray, "..."]]:
             raise UserError(f"{run.name}: model.{name} is {getattr(cfg, name)}; expected {required} for this format")
     params, alive = scene.params, np.asarray(scene.alive)
     gaussians = {name: rows for name, rows in params.gaussians._asdict().items() if rows is not None}
-    if params.paths is not None:
-        follows = np.asarray(has_path(gaussians["lifetimes"]))
-        gaussians["paths"] = np.where(follows[:, None, None], np.asarray(params.paths)[scene.path_of], 0)
     if "gate" in gaussians:
         gaussians["gate"] = np.where(openness(gaussians["gate"], cfg) > 0, gaussians["gate"], -np.inf)
     coefficients = [gaussians.pop("illumination_dc"), gaussians.pop("illumination_rest")]
     gaussians["illumination"] = np.concatenate(coefficients, axis=-1)[:, : (run.renderer().sh_degree + 1) ** 2]
     unit = length_unit(scene.extent, cfg)
+    gaussians = {name: np.asarray(rows)[alive] for name, rows in gaussians.items()}
+    if params.paths is not None:
+        gaussians["paths"] = np.asarray(params.paths)[np.asarray(scene.path_of)[alive]]
+        gaussians["paths"][~np.asarray(has_path(gaussians["lifetimes"]))] = 0
     tree: dict[str, Any] = {
-        "gaussians": {name: np.asarray(rows)[alive] for name, rows in gaussians.items()},
+        "gaussians": gaussians,
         "hexplane": params.hexplane,
         "heads": params.heads,
         "ocd": params.ocd,

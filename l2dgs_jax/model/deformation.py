@@ -60,7 +60,8 @@ def deform(
         if changes.light is not None:
             coefficients = (1 + changes.light) * coefficients
     opacities = jnp.where(alive[None], jax.nn.sigmoid(logit_opacities), 0)
-    if params.paths is not None and scene.path_of is not None and gaussians.lifetimes is not None:
+    if params.paths is not None:
+        assert scene.path_of is not None and gaussians.lifetimes is not None, "expected who follows the paths, and when"
         displacements, visibility = _on_paths(params.paths, scene.path_of, gaussians.lifetimes, cameras.time)
         means, opacities = means + displacements, visibility * opacities
     basis = _basis(gaussians.means, cameras.viewmat, cfg.sh_degree)
@@ -141,10 +142,12 @@ def _on_paths(
     def displaced(weights: Float[Array, " K"], start: Int[Array, ""]) -> Float[Array, "P 3"]:
         points = jax.lax.dynamic_slice_in_dim(paths, start, near, 1)
         weights = jax.lax.dynamic_slice_in_dim(weights, start, near)
+        # One by one: on a CPU, XLA's sums along short axes take far longer.
         return sum((weights[k] * points[:, k] for k in range(near)), jnp.zeros_like(points[:, 0]))
 
-    displacements = jax.vmap(displaced)(path_weights(times, knots), start)[:, path_of]
-    return jnp.where(follows[None, :, None], displacements, 0), jnp.where(follows[None], visibility, 1)
+    own = jnp.where(follows, path_of, len(paths))
+    displacements = jax.vmap(displaced)(path_weights(times, knots), start).at[:, own].get(mode="fill", fill_value=0)
+    return displacements, jnp.where(follows[None], visibility, 1)
 
 
 def has_path(lifetimes: Float[Array, "N 2"]) -> Bool[Array, " N"]:

@@ -35,7 +35,7 @@ class Seeds(NamedTuple):
         points: canonical centres of the Gaussians, world units.
         colors: in the dark frames, sRGB in [0, 1].
         spacings: how far they are from each other, world units.
-        paths: as in `Gaussians`.
+        paths: as in `SceneParams`.
         lifetimes: as in `Gaussians`.
     """
 
@@ -177,7 +177,7 @@ def _initialise(
     extent: Float[Array, ""],
     exposures: Float[Array, "F 3"] | None,
     curve: Float[Array, " R"] | None,
-    paths: Float[Array, "S K 3"] | None = None,
+    paths: Float[Array, "T K 3"] | None = None,
     lifetimes: Float[Array, "P 2"] | None = None,
     *,
     cfg: ModelConfig,
@@ -186,7 +186,7 @@ def _initialise(
 ) -> Scene:
     """See `initialise`; `illumination` is what the spherical harmonics are to give, without their offset.
 
-    The Gaussians of finite lifetime, which come last, follow the paths one by one.
+    The Gaussians of finite lifetime, which come last, follow the first of the paths one by one.
     """
     count, num_rest = len(points), (cfg.sh_degree + 1) ** 2 - 1
     keys = jax.random.split(key, 6)

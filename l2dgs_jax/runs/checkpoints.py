@@ -157,16 +157,15 @@ def load(path: Path, config: Config, num_frames: int) -> Checkpoint:
                     f"{path}: of version {version}; expected at most {VERSION}: a newer l2dgs_jax has written it"
                 )
             check_settings(path, from_dict(header["config"]), config)
-            sources = {name: name for name in expected}
-            if version < 3:
-                sources = {name: name.replace(".paths", ".gaussians.paths") for name in expected if name != _PATH_OF}
-            misfit = next((name for name in sources if not _fits(archive, sources[name], expected[name])), None)
+            sources = {name: _source(name, version) for name in expected if version >= 3 or name != _PATH_OF}
+            misfit = next((s for name, s in sources.items() if not _fits(archive, s, expected[name])), None)
             if misfit:
                 raise UserError(
                     f"{path}: the array {misfit} is missing or has another shape; expected a checkpoint of this run"
                 )
-            own = lambda: np.arange(len(_read(archive, _ALIVE)), dtype=np.int32)  # each Gaussian's path
-            arrays = (jnp.asarray(_read(archive, sources[name]) if name in sources else own()) for name in expected)
+            one_by_one = lambda: np.arange(len(_read(archive, _ALIVE)), dtype=np.int32)  # for _PATH_OF
+            read = lambda name: _read(archive, sources[name]) if name in sources else one_by_one()
+            arrays = (jnp.asarray(read(name)) for name in expected)
             state = jax.tree_util.tree_unflatten(treedef, arrays)
             return Checkpoint(state, header["pair_capacity"], header.get("halvings", 0))
     except FileNotFoundError:
@@ -213,6 +212,12 @@ def _write(archive: zipfile.ZipFile, name: str, array: np.ndarray) -> None:
 def _read(archive: zipfile.ZipFile, name: str) -> np.ndarray:
     with archive.open(f"{name}.npy") as file:
         return npy.read_array(file, allow_pickle=False)
+
+
+def _source(name: str, version: int) -> str:
+    """What an array is called in a file of that version."""
+    place, _, last = name.rpartition(".")
+    return f"{place}.gaussians.paths" if version < 3 and last == "paths" else name
 
 
 def _fits(archive: zipfile.ZipFile, name: str, leaf: jax.ShapeDtypeStruct) -> bool:

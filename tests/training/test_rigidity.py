@@ -140,17 +140,21 @@ def test_moving_gaussians_are_drawn_and_compared_at_two_near_instants(scene_and_
 
 def test_gaussians_on_paths_are_drawn_as_if_their_gates_were_open_while_they_live(scene_and_config, calls, monkeypatch):
     scene, config = scene_and_config
-    rows, number = len(scene.alive), jnp.arange(len(scene.alive))
+    number = jnp.arange(len(scene.alive))
     on_path = scene.alive & (number % 2 == 0)  # these have closed gates
     lifetime = jnp.where((number % 4 == 0)[:, None], jnp.array([0.0, 0.5]), jnp.array([0.5, 1.0]))
     lifetimes = jnp.where(on_path[:, None], lifetime, jnp.array([-jnp.inf, jnp.inf]))
-    params = with_gaussians(scene, lifetimes=lifetimes).params._replace(paths=jnp.zeros((1, 4, 3)))
-    tracked = scene._replace(params=params, path_of=jnp.zeros(rows, int))
+    paths = jnp.asarray(np.random.default_rng(0).normal(0, 1, (5, 4, 3)))
+    params = with_gaussians(scene, lifetimes=lifetimes).params._replace(paths=paths)
+    tracked = scene._replace(params=params, path_of=7 * number % 5)
+    means = np.asarray(scene.params.gaussians.means)
     monkeypatch.setattr(module, "DRAWN", int(scene.alive.sum()) // 3)
     shares = []
     for seed in range(12):
         rigidity(tracked, config, jax.random.key(seed))
         drawn, cameras, *_ = calls[-1]
+        rows = [int(np.flatnonzero((means == mean).all(-1))[0]) for mean in np.asarray(drawn.params.gaussians.means)]
+        np.testing.assert_array_equal(drawn.path_of, tracked.path_of[np.array(rows)])
         born, dies = drawn.params.gaussians.lifetimes.T
         if not cameras.time[0] < 0.5 < cameras.time[1]:
             assert np.all(born <= cameras.time[0])

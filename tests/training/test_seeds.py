@@ -218,22 +218,24 @@ def test_the_largest_number_of_gaussians_limits_the_seeds(tracked, monkeypatch):
 
 
 @pytest.mark.slow
-def test_only_seeds_learn_their_paths(tracked):
+def test_only_paths_that_are_followed_are_learned(tracked):
     config, start = tracked
+    followed = jnp.isfinite(start.scene.params.gaussians.lifetimes).all(-1)
+    start = start._replace(scene=start.scene._replace(path_of=jnp.where(followed, start.scene.path_of, 2)))
     end = state_of(finish(make_dataset(), config, start)).scene
-    points = len(make_dataset().points)
     before, after = (np.asarray(scene.params.paths) for scene in (start.scene, end))
     moved = np.abs(after - before).max((1, 2))
     assert (moved[:2] > 0).all()
     assert not moved[2:].any()
-    assert np.isinf(end.params.gaussians.lifetimes[:points]).all()
 
 
-def test_paths_are_shared_at_births_and_saved_in_checkpoints(tracked, tmp_path):
+@pytest.mark.parametrize("method", ["mcmc", "adaptive"])
+def test_paths_are_shared_at_births_and_saved_in_checkpoints(tracked, tmp_path, method):
     config, state = tracked
     rows = 2 * len(state.scene.alive)
-    config = overrides.replace(config, {"density.method": "mcmc", "density.max_gaussians": rows})
+    config = overrides.replace(config, {"density.method": method, "density.max_gaussians": rows})
     state = with_capacity(state, rows)
+    state = state._replace(stats=jax.tree.map(jnp.ones_like, state.stats))
     grown, missing = densify(state, config, 1)
     assert missing == 0
     lifetimes, path_of = np.asarray(grown.scene.params.gaussians.lifetimes), np.asarray(grown.scene.path_of)
@@ -246,9 +248,17 @@ def test_paths_are_shared_at_births_and_saved_in_checkpoints(tracked, tmp_path):
     assert_equal_states(checkpoints.load(tmp_path / "checkpoint.npz", config, FRAMES).state, grown)
 
 
+def with_paths(state):
+    """The parts of a state that have an array of paths."""
+    return state.scene.params, state.adam.mu, state.adam.nu
+
+
 def test_checkpoints_in_which_each_gaussian_has_a_path_of_its_own_are_read(tracked, tmp_path):
     """As versions before shared paths wrote them."""
     config, state = tracked
+    ramp = np.linspace(1, 2, state.scene.params.paths.size).reshape(state.scene.params.paths.shape)
+    mu, nu = state.adam.mu._replace(paths=jnp.asarray(ramp)), state.adam.nu._replace(paths=jnp.asarray(2 * ramp))
+    state = state._replace(adam=state.adam._replace(mu=mu, nu=nu))
     path = tmp_path / "checkpoint.npz"
     checkpoints.save(path, Checkpoint(state, 64), config)
     with np.load(path) as file:
@@ -258,5 +268,17 @@ def test_checkpoints_in_which_each_gaussian_has_a_path_of_its_own_are_read(track
         arrays[f"{part}.gaussians.paths"] = arrays.pop(f"{part}.paths")[path_of]
     arrays["header"] = np.array(json.dumps(json.loads(str(arrays["header"])) | {"version": 2}))
     np.savez(path, **arrays)
-    scene = checkpoints.load(path, config, FRAMES).state.scene
-    np.testing.assert_array_equal(scene.params.paths[scene.path_of], state.scene.params.paths[path_of])
+    found = checkpoints.load(path, config, FRAMES).state
+    assert found.scene.path_of.dtype == state.scene.path_of.dtype
+    for new, old in zip(with_paths(found), with_paths(state), strict=True):
+        np.testing.assert_array_equal(new.paths[found.scene.path_of], old.paths[path_of])
+
+
+def test_members_with_fewer_paths_than_others_get_unused_ones(tracked):
+    state = tracked[1]
+    few, many = len(state.scene.params.paths), 2 * len(state.scene.params.paths)
+    wide = with_capacity(state, len(state.scene.alive), many)
+    for before, after in zip(with_paths(state), with_paths(wide), strict=True):
+        np.testing.assert_array_equal(after.paths[:few], before.paths)
+        assert after.paths.shape[0] == many
+        assert not after.paths[few:].any()
