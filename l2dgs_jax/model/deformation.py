@@ -61,7 +61,8 @@ def deform(
             coefficients = (1 + changes.light) * coefficients
     opacities = jnp.where(alive[None], jax.nn.sigmoid(logit_opacities), 0)
     if params.paths is not None:
-        assert scene.path_of is not None and gaussians.lifetimes is not None, "expected who follows the paths, and when"
+        assert scene.path_of is not None, "expected who follows the paths"
+        assert gaussians.lifetimes is not None, "expected when they do"
         displacements, visibility = _on_paths(params.paths, scene.path_of, gaussians.lifetimes, cameras.time)
         means, opacities = means + displacements, visibility * opacities
     basis = _basis(gaussians.means, cameras.viewmat, cfg.sh_degree)

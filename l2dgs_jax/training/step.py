@@ -1,5 +1,6 @@
 """A training step of one scene as pure functions: the update, the start of a stage, densification."""
 
+from functools import partial
 from typing import TypeVar
 
 import jax
@@ -7,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from l2dgs_jax.config import Config
+from l2dgs_jax.model.deformation import has_path
 from l2dgs_jax.runtime import devices
 from l2dgs_jax.training import densification, optimizer, relocation
 from l2dgs_jax.training.objective import objective
@@ -141,16 +143,25 @@ def densify(state: TrainState, config: Config, growths_left: Int[Array, ""] | in
     else:
         result = densification.densify(scene.params.gaussians, scene.alive, state.stats, scene.extent, key, cfg)
 
-    def reset(rows: Float[Array, "..."]) -> Float[Array, "..."]:
-        return jnp.where(result.changed.reshape(-1, *[1] * (rows.ndim - 1)), 0, rows)
+    path_of = None if scene.path_of is None else scene.path_of[result.source]
+
+    def reset(rows: Float[Array, "..."], changed: Bool[Array, "..."]) -> Float[Array, "..."]:
+        return jnp.where(changed.reshape(-1, *[1] * (rows.ndim - 1)), 0, rows)
+
+    def renewed(moments: SceneParams) -> SceneParams:
+        """Moments of Gaussians, and of paths whose followers change, start anew."""
+        paths = moments.paths
+        if paths is not None and path_of is not None and result.gaussians.lifetimes is not None:
+            follows = result.changed & has_path(result.gaussians.lifetimes)
+            own = jnp.where(follows, path_of, len(paths))
+            paths = reset(paths, jnp.zeros(len(paths), bool).at[own].set(True, mode="drop"))
+        return map_gaussians(partial(reset, changed=result.changed), moments)._replace(paths=paths)
 
     grown = TrainState(
         scene=scene._replace(
-            params=scene.params._replace(gaussians=result.gaussians),
-            alive=result.alive,
-            path_of=None if scene.path_of is None else scene.path_of[result.source],
+            params=scene.params._replace(gaussians=result.gaussians), alive=result.alive, path_of=path_of
         ),
-        adam=state.adam._replace(mu=map_gaussians(reset, state.adam.mu), nu=map_gaussians(reset, state.adam.nu)),
+        adam=state.adam._replace(mu=renewed(state.adam.mu), nu=renewed(state.adam.nu)),
         stats=jax.tree.map(jnp.zeros_like, state.stats),
         step=state.step,
     )
