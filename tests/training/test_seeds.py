@@ -235,7 +235,9 @@ def test_paths_are_shared_at_births_and_saved_in_checkpoints(tracked, tmp_path, 
     rows = 2 * len(state.scene.alive)
     config = overrides.replace(config, {"density.method": method, "density.max_gaussians": rows})
     state = with_capacity(state, rows)
-    state = state._replace(stats=jax.tree.map(jnp.ones_like, state.stats))
+    ones = lambda tree: jax.tree.map(jnp.ones_like, tree)
+    adam = state.adam._replace(mu=ones(state.adam.mu), nu=ones(state.adam.nu))
+    state = state._replace(adam=adam, stats=ones(state.stats))
     grown, missing = densify(state, config, 1)
     assert missing == 0
     lifetimes, path_of = np.asarray(grown.scene.params.gaussians.lifetimes), np.asarray(grown.scene.path_of)
@@ -244,6 +246,9 @@ def test_paths_are_shared_at_births_and_saved_in_checkpoints(tracked, tmp_path, 
     for row, own in enumerate(path_of):
         if np.isfinite(lifetimes[row]).all() and grown.scene.alive[row]:
             np.testing.assert_array_equal(lifetimes[row], TWO_SEEDS.lifetimes[own])
+    as_before = np.bincount(followed, minlength=len(grown.scene.params.paths)) < 2
+    for moments in (grown.adam.mu, grown.adam.nu):
+        np.testing.assert_array_equal(moments.paths.all((1, 2)), as_before)  # anew where there are more followers
     checkpoints.save(tmp_path / "checkpoint.npz", Checkpoint(grown, 64), config)
     assert_equal_states(checkpoints.load(tmp_path / "checkpoint.npz", config, FRAMES).state, grown)
 
