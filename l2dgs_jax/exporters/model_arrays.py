@@ -34,9 +34,10 @@ def model_arrays(run: Run) -> dict[str, Shaped[np.ndarray, "..."]]:
     gaussians["illumination"] = np.concatenate(coefficients, axis=-1)[:, : (run.renderer().sh_degree + 1) ** 2]
     unit = length_unit(scene.extent, cfg)
     gaussians = {name: np.asarray(rows)[alive] for name, rows in gaussians.items()}
-    if params.paths is not None:
-        gaussians["paths"] = np.asarray(params.paths)[np.asarray(scene.path_of)[alive]]
-        gaussians["paths"][~np.asarray(has_path(gaussians["lifetimes"]))] = 0
+    if params.paths is not None and params.gaussians.lifetimes is not None:
+        follows = np.asarray(has_path(params.gaussians.lifetimes))[alive]
+        paths = np.asarray(params.paths)[np.asarray(scene.path_of)[alive]]
+        gaussians["paths"] = np.where(follows[:, None, None], paths, 0)
     tree: dict[str, Any] = {
         "gaussians": gaussians,
         "hexplane": params.hexplane,
