@@ -47,12 +47,9 @@ def rigidity(scene: Scene, cfg: ModelConfig, key: PRNGKeyArray) -> Float[Array, 
     subset = compaction.highest(scores, min(DRAWN, len(scores)))
     drawn = jax.tree.map(lambda values: compaction.select(values, subset, 0), gaussians)
     anywhere = lambda size: jnp.broadcast_to(jnp.eye(size, dtype=dtype), (2, size, size))
+    alive, path_of = jax.tree.map(lambda rows: rows[subset.rows], (scene.alive, scene.path_of))
     moved = deform(
-        scene._replace(
-            params=scene.params._replace(gaussians=drawn),
-            alive=scene.alive[subset.rows],
-            path_of=None if scene.path_of is None else scene.path_of[subset.rows],
-        ),
+        scene._replace(params=scene.params._replace(gaussians=drawn), alive=alive, path_of=path_of),
         Camera(anywhere(4), anywhere(3), instants),  # motion does not depend on where the camera is
         cfg,
         moving=True,

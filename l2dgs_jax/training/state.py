@@ -66,23 +66,17 @@ def randomness(state: TrainState, config: Config) -> PRNGKeyArray:
     return jax.random.fold_in(jax.random.key(config.seed), state.step)
 
 
-def with_capacity(state: TrainState, capacity: int, path_capacity: int | None = None) -> TrainState:
-    """The same state with dead rows appended up to `capacity`, and unused paths up to `path_capacity`."""
+def with_capacity(state: TrainState, capacity: int, path_capacity: int = 0) -> TrainState:
+    """The same state with dead rows appended up to `capacity` and unused paths up to `path_capacity`."""
     pad = partial(pad_rows, capacity=capacity)
 
     def padded(params: SceneParams) -> SceneParams:
-        paths = params.paths
-        if paths is not None and path_capacity is not None:
-            paths = pad_rows(paths, path_capacity)
+        paths = jax.tree.map(lambda rows: pad_rows(rows, max(len(rows), path_capacity)), params.paths)
         return map_gaussians(pad, params)._replace(paths=paths)
 
-    scene = state.scene
+    alive, path_of = jax.tree.map(pad, (state.scene.alive, state.scene.path_of))
     return TrainState(
-        scene=scene._replace(
-            params=padded(scene.params),
-            alive=pad(scene.alive),
-            path_of=None if scene.path_of is None else pad(scene.path_of),
-        ),
+        scene=state.scene._replace(params=padded(state.scene.params), alive=alive, path_of=path_of),
         adam=state.adam._replace(mu=padded(state.adam.mu), nu=padded(state.adam.nu)),
         stats=jax.tree.map(pad, state.stats),
         step=state.step,

@@ -143,7 +143,7 @@ def densify(state: TrainState, config: Config, growths_left: Int[Array, ""] | in
     else:
         result = densification.densify(scene.params.gaussians, scene.alive, state.stats, scene.extent, key, cfg)
 
-    path_of = None if scene.path_of is None else scene.path_of[result.source]
+    path_of = jax.tree.map(lambda rows: rows[result.source], scene.path_of)
 
     def reset(rows: Float[Array, "..."], changed: Bool[Array, "..."]) -> Float[Array, "..."]:
         return jnp.where(changed.reshape(-1, *[1] * (rows.ndim - 1)), 0, rows)

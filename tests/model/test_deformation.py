@@ -22,8 +22,7 @@ N = 6
 
 
 @partial(jax.jit, static_argnames=("cfg", "moving"))
-def deform_jit(params, cameras, alive, bounds, cfg, extent=1.0, **options):
-    path_of = options.pop("path_of", None)
+def deform_jit(params, cameras, alive, bounds, cfg, extent=1.0, path_of=None, **options):
     return deform(Scene(params, alive, bounds, jnp.asarray(extent), path_of), cameras, cfg, **options)
 
 
