@@ -19,6 +19,7 @@ from experiments.members import Member, labels
 from experiments.web_page import write_page
 from l2dgs_jax.data.images import encode_jpeg, to_bytes
 from l2dgs_jax.data.parsing import read_json, value
+from l2dgs_jax.data.stacks import evenly_spread
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.runs import open_run
 from l2dgs_jax.runs.views import views
@@ -86,7 +87,7 @@ def _scene(study: Path, scene: str, members: dict[str, Member], count: int) -> d
         if split is None:
             split = run.dataset.test
             in_time = np.argsort(split.cameras.time, kind="stable")
-            chosen = in_time[np.unique(np.linspace(0, len(in_time) - 1, count).round().astype(int))]
+            chosen = in_time[evenly_spread(len(in_time), count)]
             pictures[INPUT] = [_url(to_bytes(split.images[i])) for i in chosen]
         cameras = Camera(*(x[chosen] for x in split.cameras))
         pictures[name] = [_url(to_bytes(output.images.welllit)) for output in views(run, cameras)]

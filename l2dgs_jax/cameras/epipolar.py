@@ -41,9 +41,13 @@ def epipolar_geometry(cameras: Camera, first: int, second: int | Sequence[int]) 
 
 def project(
     geometry: EpipolarGeometry, pixels: Float[np.ndarray, "*S 2"], inverse_depth: Float[np.ndarray, "*S"]
-) -> Float[np.ndarray, "*S 2"]:
-    """Pixels of the second view that show what the given pixels of the first see at `inverse_depth`."""
-    return _dehomogenised(pixels @ geometry.H[:, :2].T + geometry.H[:, 2] + inverse_depth[..., None] * geometry.e)
+) -> Float[np.ndarray, "... 2"]:
+    """Pixels of the second view, or of K others, that show what pixels of the first see at `inverse_depth`.
+
+    For K others, pixels must be [N 2].
+    """
+    H, e = geometry.H, geometry.e[..., None, :]
+    return _dehomogenised(pixels @ H[..., :2].swapaxes(-1, -2) + H[..., None, :, 2] + inverse_depth[..., None] * e)
 
 
 def static_residuals(

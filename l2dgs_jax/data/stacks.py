@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Shaped
+from jaxtyping import Bool, Float, Int, Shaped
 from numpy.typing import DTypeLike
 
 from l2dgs_jax.errors import UserError
@@ -64,6 +64,11 @@ def stacked(
         ) from None
 
 
+def evenly_spread(count: int, most: int) -> Int[np.ndarray, " N"]:
+    """Indices of at most so many of `count` items, from the first one to the last."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
+
+
 def pixel_mean(
     stack: Shaped[np.ndarray, "F H W *C"], valid: Bool[np.ndarray, "F H W"] | None = None
 ) -> Float[np.ndarray, "*C"]:
@@ -74,3 +79,10 @@ def pixel_mean(
         total += frame.sum((0, 1), np.float64, where=counted.reshape(*counted.shape, *[1] * total.ndim))
         count += int(counted.sum())
     return np.asarray(total / count)
+
+
+def nan_median(stack: Float[np.ndarray, "F P 3"]) -> Float[np.ndarray, "P 3"]:
+    """Median over the first axis, ignoring NaN; faster than NumPy's."""
+    last = np.count_nonzero(~np.isnan(stack), axis=0, keepdims=True) - 1
+    ordered = np.sort(stack, axis=0)  # NaN last
+    return np.take_along_axis(ordered, np.concatenate([last // 2, (last + 1) // 2]), axis=0).mean(0)

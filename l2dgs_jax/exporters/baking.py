@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from l2dgs_jax.cameras import select_camera
 from l2dgs_jax.config import ModelConfig
+from l2dgs_jax.data.stacks import evenly_spread
 from l2dgs_jax.exporters.splats import Splats
 from l2dgs_jax.metrics import psnr
 from l2dgs_jax.model.decomposition import as_light, full_light, product
@@ -191,7 +192,7 @@ def _canvas(run: Run) -> _Canvas:
 def _at_instant(run: Run, time: float, every_other: slice) -> Camera:
     """Training cameras, spread evenly over all of them, set to one instant; `every_other` picks those to use."""
     cameras = run.dataset.train.cameras
-    spread = np.unique(np.linspace(0, len(cameras.time) - 1, 2 * FITTED_VIEWS - 1).round().astype(int))
+    spread = evenly_spread(len(cameras.time), 2 * FITTED_VIEWS - 1)
     chosen = spread[every_other] if len(spread) > 1 else spread
     viewmat, K = (jnp.asarray(x[chosen], float) for x in (cameras.viewmat, cameras.K))
     return Camera(viewmat, K, jnp.full(len(chosen), time, float))

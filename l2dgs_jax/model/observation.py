@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from l2dgs_jax.cameras.geometry import points_inside
-from l2dgs_jax.data.stacks import pixel_mean, stacked
+from l2dgs_jax.data.stacks import nan_median, pixel_mean, stacked
 from l2dgs_jax.runtime.prefetch import prefetch
 from l2dgs_jax.types import Camera
 
@@ -37,9 +37,12 @@ def observed_colors(
     frames = prefetch(lambda i: _observed(points, cameras, images, valid, i), range(len(images)))
     seen = stacked(frames, shape, images.dtype, in_file=math.prod(shape) > VALUES_IN_MEMORY)
     chunk = max(VALUES_IN_MEMORY // (3 * len(images)), 1)
-    parts = [_nan_median(seen[:, i : i + chunk].astype(np.float32)) for i in range(0, max(len(points), 1), chunk)]
+    parts = [nan_median(seen[:, i : i + chunk].astype(np.float32)) for i in range(0, max(len(points), 1), chunk)]
     colors = np.concatenate(parts)
-    return np.where(np.isnan(colors).all(-1, keepdims=True), pixel_mean(images, valid).astype(colors.dtype), colors)
+    unseen = np.isnan(colors).all(-1)
+    if unseen.any():
+        colors[unseen] = pixel_mean(images, valid)
+    return colors
 
 
 def exposures(
@@ -64,7 +67,7 @@ def exposures(
     seen = np.log(np.maximum(np.stack([*frames]).astype(np.float32), MIN_VALUE))
     gains = np.zeros((len(images), 1, 3), np.float32)
     for _ in range(ALTERNATIONS):
-        gains = np.nan_to_num(_nan_median((seen - _nan_median(seen - gains)).swapaxes(0, 1)))[:, None]
+        gains = np.nan_to_num(nan_median((seen - nan_median(seen - gains)).swapaxes(0, 1)))[:, None]
         gains -= gains.mean(0)
     return gains[:, 0]
 
@@ -88,10 +91,3 @@ def _observed(
     if valid is not None:
         colors[np.flatnonzero(inside)[~valid[frame][row, column]]] = np.nan
     return colors
-
-
-def _nan_median(seen: Float[np.ndarray, "F P 3"]) -> Float[np.ndarray, "P 3"]:
-    """Median over the first axis, ignoring NaN."""
-    last = np.count_nonzero(~np.isnan(seen), axis=0, keepdims=True) - 1
-    seen = np.sort(seen, axis=0)  # NaN last
-    return np.take_along_axis(seen, np.concatenate([last // 2, (last + 1) // 2]), axis=0).mean(0)

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from l2dgs_jax.data.color import MID_GREY, linear_to_srgb, srgb_to_linear
+from l2dgs_jax.data.stacks import evenly_spread
 
 Tone = Literal["linear-light", "gain"]
 
@@ -108,7 +109,7 @@ def recognise(images: Float[np.ndarray, "F H W 3"], valid: Bool[np.ndarray, "F H
 def _sampled_frames(
     images: Float[np.ndarray, "F H W 3"], valid: Bool[np.ndarray, "F H W"] | None
 ) -> Iterator[tuple[Float[np.ndarray, "H W 3"], Bool[np.ndarray, "H W"]]]:
-    for index in np.unique(np.linspace(0, len(images) - 1, SAMPLED_FRAMES).round().astype(int)):
+    for index in evenly_spread(len(images), SAMPLED_FRAMES):
         image = images[index].astype(np.float32)
         yield image, np.ones(image.shape[:2], bool) if valid is None else valid[index]
 

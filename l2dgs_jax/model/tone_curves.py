@@ -10,15 +10,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from l2dgs_jax.data.stacks import evenly_spread
 from l2dgs_jax.model.decomposition import clip_unit
-from l2dgs_jax.model.tone import Darkening
+from l2dgs_jax.model.tone import SAMPLED_FRAMES, Darkening
 from l2dgs_jax.types import ToneCurves
 
 RAMPS = 16  # linear segments of a curve
 KNOTS: Float[np.ndarray, "16"] = np.arange(1, RAMPS + 1) / RAMPS  # well-lit values where they end
 MIN_VALUE = 1 / 255  # sRGB; darker values are raised to it, as they say nothing about a curve
 EXPONENT_RANGE = 0.5, 4.0  # of plausible power laws; frames of a single value would give 0
-SAMPLED_FRAMES = 12
 
 # Power laws are lines in log-log coordinates; the matrix takes the closest one away from log values at the knots.
 _LINES = np.stack([np.ones(RAMPS), np.log(KNOTS)], axis=-1)
@@ -75,7 +75,7 @@ def bend(log_rises: Float[Array, "V R"]) -> Float[Array, ""]:
 
 def equalising_law(frames: Float[np.ndarray, "F H W 3"], valid: Bool[np.ndarray, "F H W"] | None) -> Darkening:
     """The power law closest to the curve that `equalisation` aims at, the pixels of all frames pooled."""
-    sampled = np.unique(np.linspace(0, len(frames) - 1, SAMPLED_FRAMES).round().astype(int))
+    sampled = evenly_spread(len(frames), SAMPLED_FRAMES)
     pixels = jnp.asarray(frames[sampled].reshape(1, -1, *frames.shape[2:]), float)
     counted = None if valid is None else jnp.asarray(valid[sampled].reshape(1, -1, frames.shape[2]))
     log_dark, log_lit = np.asarray(_log_quantiles(pixels, counted)[0]), np.log(KNOTS)

@@ -48,12 +48,12 @@ class Pace:
 
 def _work(config: Config, done: int, gaussians: int) -> Float[np.ndarray, " S"]:
     """Relative work of each step after the first `done`, in an arbitrary unit."""
-    work, stages = np.empty(config.steps - done), ((0, config.coarse_steps), (config.coarse_steps, config.fine_steps))
+    work = np.empty(config.steps - done)
     for step in range(done + 1, config.steps + 1):
         fine = step > config.coarse_steps
-        start, steps = stages[fine]
         work[step - done - 1] = (FINE_STEP if fine else 1) * (FIXED_COST + gaussians)
-        if config.density.method == "mcmc" and engine.density_due(step - start, config):
-            most, left = int(config.density.max_gaussians), engine.growths_left(step - start, steps, config)
+        left = engine.growths_left(step - config.coarse_steps if fine else step, fine, config)
+        if config.density.method == "mcmc" and left:
+            most = int(config.density.max_gaussians)
             gaussians = int(relocation.population(jnp.asarray(gaussians), most, left))
     return work

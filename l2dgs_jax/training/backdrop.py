@@ -8,6 +8,7 @@ from scipy.spatial import cKDTree
 
 from l2dgs_jax.cameras.geometry import camera_centres, pixel_rays, project_points
 from l2dgs_jax.cameras.ground import Ground, find_ground, ground_depths
+from l2dgs_jax.runtime.prefetch import prefetch
 from l2dgs_jax.types import Camera
 
 DEPTH_CELL = 4  # side in pixels of a square that has one depth
@@ -55,7 +56,8 @@ class Backdrop(NamedTuple):
 def find_backdrop(points: Float[np.ndarray, "P 3"], camera: Camera, height: int, width: int) -> Backdrop:
     """The backdrop of frames of that size, of points in world units."""
     cameras = Cameras(*(np.asarray(x, np.float64) for x in camera))
-    around = [depths_around(points, viewmat, K, height, width) for viewmat, K, _ in zip(*cameras, strict=True)]
+    frames = range(len(cameras.time))
+    around = prefetch(lambda i: depths_around(points, cameras.viewmat[i], cameras.K[i], height, width), frames)
     still, hidden = zip(*around, strict=True)
     return Backdrop(cameras, Depths(np.stack(still, axis=1), np.stack(hidden)), find_ground(points, cameras.viewmat))
 

@@ -9,10 +9,12 @@ from jaxtyping import Bool, Float, Float32, Int
 from l2dgs_jax.cameras.geometry import project_points
 from l2dgs_jax.data.color import srgb_to_linear
 from l2dgs_jax.data.dataset import Split
+from l2dgs_jax.data.stacks import evenly_spread, nan_median
 from l2dgs_jax.training.backdrop import Backdrop, hidden_depths, unprojected
 from l2dgs_jax.training.tracks import Tracks
 
-MAX_FRAMES = 60  # frames that colours of static surfaces are taken from
+CLIP_PART = 240  # frames of a part of a long clip, which is compared with itself only: not all of the scene is in view
+MAX_FRAMES = 60  # frames of a part that colours of static surfaces are taken from
 MIN_SEEN = 3  # of these, in which a surface must be seen
 REACH = 9  # side in pixels of the square around a track in which static surfaces may be hidden
 BLUR_SIGMA = 1.0  # standard deviation in pixels of the Gaussian that suppresses noise
@@ -52,38 +54,54 @@ def likeness_to_background(
         backdrop: of these.
         tracks: what seems to move there.
     """
+    in_time = np.argsort(backdrop.cameras.time, kind="stable")
+    likeness = Likeness(*np.zeros((2, len(frames)), bool))
+    for part in np.array_split(in_time, -(-len(in_time) // CLIP_PART)):
+        asked = np.isin(frames, part)
+        if asked.any():
+            here, elsewhere = _colors(frames[asked], pixels[asked], part.tolist(), split, backdrop, tracks)
+            known = np.isfinite(here).all(-1) & (np.isfinite(elsewhere[..., 0]).sum(0) >= MIN_SEEN)
+            alike = known.copy()
+            if known.any():
+                alike[known] = _alike(here[known], nan_median(elsewhere[:, known]))
+            likeness.alike[asked], likeness.differs[asked] = alike, known & ~alike
+    return likeness
+
+
+def _colors(
+    frames: Int[np.ndarray, " N"],
+    pixels: Float[np.ndarray, "N 2"],
+    part: list[int],
+    split: Split,
+    backdrop: Backdrop,
+    tracks: Tracks,
+) -> tuple[Float32[np.ndarray, "N 3"], Float32[np.ndarray, "S N 3"]]:
+    """Light at the pixels, NaN where not valid, and of what they hide, NaN in those of S frames that do not show it."""
     height, width = split.images.shape[1:3]
     viewmats, Ks, _ = backdrop.cameras
     surfaces = unprojected(backdrop.cameras, frames, pixels, hidden_depths(backdrop, frames, pixels))
-    chosen = np.unique(np.linspace(0, len(viewmats) - 1, MAX_FRAMES).round().astype(int)).tolist()
+    chosen = [part[i] for i in evenly_spread(len(part), MAX_FRAMES)]
     elsewhere = np.full((len(chosen), len(surfaces), 3), np.nan, np.float32)
-    here = np.zeros((len(surfaces), 3), np.float32)
-    for frame in range(len(viewmats)) if len(surfaces) else ():
-        asked = frames == frame
-        if frame not in chosen and not asked.any():
+    here = np.full((len(surfaces), 3), np.nan, np.float32)
+    for frame in part:
+        asked = np.flatnonzero(frames == frame)
+        if frame not in chosen and not len(asked):
             continue
         light = _smooth_light(split.images[frame])
+        if split.valid is not None:
+            light[~split.valid[frame]] = np.nan
         column, row = pixels[asked].astype(int).T
         here[asked] = light[row, column]
         if frame in chosen:
-            hidden = np.zeros((height, width), np.uint8)
+            shown = np.zeros((height, width), np.uint8)
             column, row = tracks.pixels[tracks.frames == frame].astype(int).T
-            hidden[row, column] = 1
-            free = cv2.dilate(hidden, np.ones((REACH, REACH), np.uint8)) == 0
-            if split.valid is not None:
-                free &= split.valid[frame]
+            shown[row, column] = 1
+            light[cv2.dilate(shown, np.ones((REACH, REACH), np.uint8)) > 0] = np.nan
             places, depth = project_points(surfaces, viewmats[frame], Ks[frame])
             seen = np.flatnonzero((depth > 0) & ((places >= 0) & (places < (width, height))).all(-1))  # never NaN
             column, row = places[seen].astype(int).T
-            at = free[row, column]
-            elsewhere[chosen.index(frame), seen[at]] = light[row[at], column[at]]
-    known, alike = np.isfinite(elsewhere[..., 0]).sum(0) >= MIN_SEEN, np.zeros(len(surfaces), bool)
-    if split.valid is not None:
-        column, row = pixels.astype(int).T
-        known &= split.valid[frames, row, column]
-    if known.any():
-        alike[known] = _alike(here[known], np.nanmedian(elsewhere[:, known], axis=0))
-    return Likeness(alike, known & ~alike)
+            elsewhere[chosen.index(frame), seen] = light[row, column]
+    return here, elsewhere
 
 
 def _alike(here: Float32[np.ndarray, "N 3"], elsewhere: Float32[np.ndarray, "N 3"]) -> Bool[np.ndarray, " N"]:

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
-from scipy.sparse.linalg import cg
+from scipy.sparse.linalg import LinearOperator, cg, splu
 from scipy.spatial import cKDTree
 
 from l2dgs_jax.training import parallax
@@ -76,7 +76,10 @@ def shared_depths(
     similarity = _similarity(pairs, tracks, max(MIN_VELOCITY_SIGMA, VELOCITY_SIGMA * focal_length))
     width = max(MIN_COLUMNS, COLUMNS * focal_length)
     guess = _first_guess(tracks, sights, below, pairs[:, similarity > ALIKE], width)
-    smoothness = _smoothness(tracks, pairs, similarity)
+    along = _along_tracks(tracks)
+    smoothness = along + _quadratic(
+        _combinations(len(tracks.numbers), tuple(pairs), (1, -1), NEIGHBOUR_WEIGHT * similarity)
+    )
     rays = sights.rays / sights.horizontal[:, None]
     windows = parallax.find_windows(tracks.numbers, sights.times, sights.centres, rays)
     mean = _combinations(len(rays), tuple(windows.places.T), (0.25,) * 4, 1.0)
@@ -87,8 +90,9 @@ def shared_depths(
         shaking, certainty = parallax.estimates(windows, found, focal_length)
         normal = (sparse.diags_array(weights) + smoothness + mean.T @ sparse.diags_array(certainty) @ mean).tocsr()
         residual = weights * (guess.logs - found) - smoothness @ found + mean.T @ (certainty * (shaking - mean @ found))
-        # Solving for the step makes its accuracy independent of the scene's unit.
-        step, _ = cg(normal, residual, rtol=STEP_TOLERANCE, maxiter=500, M=sparse.diags_array(1 / normal.diagonal()))
+        # Solving for the step makes its accuracy independent of the scene's unit. What is left if it has not converged
+        # is part of the next one.
+        step, _ = cg(normal, residual, rtol=STEP_TOLERANCE, maxiter=500, M=_preconditioner(normal, along))
         found = found + step
     return np.exp(found) / sights.horizontal
 
@@ -145,16 +149,24 @@ def _resting(tracks: Tracks, below: Int[np.ndarray, "2 E"], feet: Float[np.ndarr
     return distances
 
 
-def _smoothness(tracks: Tracks, pairs: Int[np.ndarray, "2 E"], similarity: Float[np.ndarray, " E"]) -> sparse.csr_array:
-    """The quadratic form of how much log-distances change along tracks and between pairs of observations."""
+def _along_tracks(tracks: Tracks) -> sparse.csr_array:
+    """The quadratic form of how much log-distances change along tracks."""
     steps, bends = (np.flatnonzero(tracks.numbers[n:] == tracks.numbers[:-n]) for n in (1, 2))
     count = len(tracks.numbers)
-    terms = (
-        _combinations(count, tuple(pairs), (1, -1), NEIGHBOUR_WEIGHT * similarity),
-        _combinations(count, (steps, steps + 1), (1, -1), CHANGE_WEIGHT),
-        _combinations(count, (bends, bends + 1, bends + 2), (1, -2, 1), CURVATURE_WEIGHT),
-    )
-    return sum(term.T @ term for term in terms).tocsr()
+    changes = _combinations(count, (steps, steps + 1), (1, -1), CHANGE_WEIGHT)
+    curvature = _combinations(count, (bends, bends + 1, bends + 2), (1, -2, 1), CURVATURE_WEIGHT)
+    return _quadratic(changes) + _quadratic(curvature)
+
+
+def _quadratic(combinations: sparse.csr_array) -> sparse.csr_array:
+    return (combinations.T @ combinations).tocsr()
+
+
+def _preconditioner(normal: sparse.csr_array, along: sparse.csr_array) -> LinearOperator:
+    """The inverse of the part of the normal equations within tracks, which are long and stiff, and of the diagonal."""
+    rest = np.maximum(normal.diagonal() - along.diagonal(), np.finfo(float).eps * normal.diagonal())
+    factors = splu((along + sparse.diags_array(rest)).tocsc(), permc_spec="NATURAL")
+    return LinearOperator(normal.shape, factors.solve)
 
 
 def _nearest(
@@ -171,8 +183,11 @@ def _nearest(
     for group in by_frame(tracks):
         group = group[np.argsort(objects[group], kind="stable")]
         for part in np.split(group, np.flatnonzero(np.diff(objects[group])) + 1):
-            around = np.abs(columns[part][:, None] - columns[part]) <= width
-            nearest[part] = np.fmin.reduce(np.where(around, distances[part], np.nan), axis=-1)
+            part = part[np.argsort(columns[part])]
+            start = np.searchsorted(columns[part], columns[part] - width)
+            stop = np.searchsorted(columns[part], columns[part] + width, side="right")
+            around = np.stack([start, stop], axis=-1).ravel()  # every other one of these slices is wanted
+            nearest[part] = np.fmin.reduceat(np.append(distances[part], np.nan), around)[::2]
     return nearest
 
 

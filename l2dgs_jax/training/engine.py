@@ -114,8 +114,8 @@ def run(members: Sequence[Member], pair_capacity: int | None = None, mesh: Mesh 
                 raise DivergedError(_complaint(report, step), Progress(step + 1, states, report, pair_capacity))
 
             stage_step = step + 1 - stage_start
-            if density_due(stage_step, config):
-                left = growths_left(stage_step, config.fine_steps if moving else config.coarse_steps, config)
+            left = growths_left(stage_step, moving, config)
+            if left:
                 states = densify_all(states, values, step + 1, left, config=static, mesh=mesh)
             yield Progress(step + 1, states, report, pair_capacity)
 
@@ -270,12 +270,13 @@ def first_capacity(split: Split, scene: Scene, views: int) -> int:
     return next_capacity(MARGIN * float(count_pairs(*per_view, cameras.viewmat, cameras.K, width, height)))
 
 
-def growths_left(stage_step: int, stage_steps: int, config: Config) -> int:
-    """How many densifications the stage has left from its step of that number on, this one included."""
-    return (min(config.density.stop - 1, stage_steps) - stage_step) // config.density.interval + 1
+def growths_left(stage_step: int, moving: bool, config: Config) -> int:
+    """How many densifications a stage has left from its step of that number on, if one follows this step; otherwise 0.
 
-
-def density_due(stage_step: int, config: Config) -> bool:
-    """Whether the stage's step of that number is followed by densification."""
+    None follows the last step of the run: what it adds could not be trained.
+    """
     cfg = config.density
-    return cfg.start < stage_step < cfg.stop and stage_step % cfg.interval == 0
+    is_last_stage = moving or not config.fine_steps
+    last = min(cfg.stop - 1, (config.fine_steps if moving else config.coarse_steps) - is_last_stage)
+    due = cfg.start < stage_step <= last and stage_step % cfg.interval == 0
+    return (last - stage_step) // cfg.interval + 1 if due else 0

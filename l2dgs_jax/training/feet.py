@@ -53,10 +53,10 @@ def find_soles(
         frames: that the feet are seen in.
         feet: their pixels.
         is_background: tells whether frames show the background at pixels.
-        focal_length: of the cameras, pixels.
+        focal_length: of the cameras along y, pixels.
         height: of the frames, pixels.
     """
-    count = int(REACH * focal_length / STEP)
+    count = max(int(REACH * focal_length / STEP), 1)
     places = np.repeat(feet[:, None], count, axis=1)
     places[..., 1] += STEP * np.arange(1, count + 1)
     within = places[..., 1] < height

@@ -2,6 +2,7 @@
 
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 from jaxtyping import Bool, Float16, Float32, Int, UInt8
 
@@ -18,6 +19,7 @@ SMOOTH_FLOW_SIZES = 0.5, 0.25, 0.125  # of downscaled frames, in which smooth fl
 # between are not harmed: there, pixels that are wrong are found out.
 MIN_JUMP = 7.0
 MAX_FORWARD_BACKWARD_ERROR = 1.5  # pixels; flow of a larger error is not trusted
+INVALID_REACH = 9  # side in pixels of the square around a pixel that is not valid in which flow follows its outline
 MAX_UNEXPLAINED = 0.8  # share of a frame's variance that warping the other may leave; more means a cut between them
 
 
@@ -26,7 +28,8 @@ class Flows(NamedTuple):
 
     Attributes:
         following: the frame after each one; itself if there is none or the flow to it is not usable.
-        displacements: pixels, from a frame to the following one and back again; NaN where they are not trusted.
+        displacements: pixels, from a frame to the following one and back again; NaN where they are not trusted, among
+            them those of pixels that are not valid, or beside such.
     """
 
     following: Int[np.ndarray, " F"]
@@ -49,6 +52,9 @@ def neighbour_flows(split: Split, *, filled: bool = False) -> Flows:
         for size in SMOOTH_FLOW_SIZES if filled else ():
             smooth = _consistent(smooth_flow(first, second, size), smooth_flow(second, first, size))
             found = np.where(np.isfinite(found), found, smooth)
+        if split.valid is not None:
+            valid = np.stack([_surely_valid(split.valid[index]) for index in (frame, following[frame])])
+            found = np.where(valid[..., None], found, np.float32(np.nan))
         same_scene = _explains(first, second, found[0]) and _explains(second, first, found[1])
         return (found if same_scene else np.full_like(found, np.nan)).astype(np.float16)
 
@@ -88,6 +94,11 @@ def _with_jumps(
     either = jumps | _seen_from(far, jumps_back), jumps_back | _seen_from(far_back, jumps)
     explained = [~unexplained(*pair, flow) for pair, flow in zip(pairs, with_jumps, strict=True)]
     return np.where((np.stack(either) & np.stack(explained))[..., None], with_jumps, found)
+
+
+def _surely_valid(valid: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
+    """The valid pixels that have none beside them that is not."""
+    return cv2.erode(valid.astype(np.uint8), np.ones((INVALID_REACH, INVALID_REACH), np.uint8)) > 0
 
 
 def _seen_from(flow: Float32[np.ndarray, "H W 2"], mask: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:

@@ -97,7 +97,7 @@ def initial_state(dataset: Dataset, config: Config) -> TrainState:
     train, points, colors = dataset.train, dataset.points, dataset.colors
     if config.model.surfaces:
         found = find_surfaces(points, train, most=max(int(config.density.max_gaussians) - len(points), 0))
-        if colors is not None:
+        if colors is not None and config.model.initial_illumination is None:
             colors = np.concatenate([colors, observed_colors(found, train.cameras, train.images, train.valid)])
         points = np.concatenate([points, found])
     order = z_order(points)

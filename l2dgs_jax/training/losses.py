@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Literal
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from l2dgs_jax import metrics
 from l2dgs_jax.config import LossConfig
@@ -24,6 +24,7 @@ def total(
     cfg: LossConfig,
     eta: Scalar | float,
     exponent_target: Scalar | float = 1.0,
+    valid: Bool[Array, "V H W"] | None = None,
 ) -> tuple[Scalar, dict[str, Scalar]]:
     """Eq. 15 over V views, plus the optional total variation of L_w and exponent prior; plane regularisers excluded.
 
@@ -35,6 +36,7 @@ def total(
         cfg: weights and forms.
         eta: exponent of Eq. 10 at this step (see `eta`).
         exponent_target: value that the exponent prior pulls B1 to.
+        valid: pixels whose brightness counts for exposure control; None for all.
 
     Returns:
         The weighted sum, and each term before its weight by name. Terms of weight 0 are neither computed nor listed,
@@ -52,7 +54,7 @@ def total(
         "ssim": (cfg.ssim, lambda: photometric_ssim(images.lowlight, target, eta, cfg.eps)),
         "exposure": (
             cfg.exposure,
-            lambda: exposure(exposed, level, cfg.exposure_window, cfg.exposure_form),
+            lambda: exposure(exposed, level, cfg.exposure_window, cfg.exposure_form, valid),
         ),
         "amplification": (cfg.amplification, lambda: amplification(images.illumination)),
         "reflectance_amplification": (cfg.reflectance_amplification, lambda: amplification(images.reflectance)),
@@ -115,7 +117,11 @@ def photometric_ssim(
 
 
 def exposure(
-    image: Float[Array, "*B H W C"], level: Scalar | float, window: int | None, form: Literal["absolute", "squared"]
+    image: Float[Array, "*B H W C"],
+    level: Scalar | float,
+    window: int | None,
+    form: Literal["absolute", "squared"],
+    valid: Bool[Array, "*B H W"] | None = None,
 ) -> Scalar:
     """Exposure control (Eq. 11; Zero-DCE, arXiv 2001.06826): distance of local mean intensity from a level.
 
@@ -125,13 +131,15 @@ def exposure(
         window: side of the square blocks, in pixels; blocks that the image cuts off are left out. None, or a window
             larger than the image: one block, the whole image.
         form: |mean - e| (paper) or (mean - e)^2 (Zero-DCE's code).
+        valid: pixels that count, all others having the wanted intensity; None for all.
     """
-    intensity = image.mean(-1)
-    if window is None or window > min(intensity.shape[-2:]):
-        means = intensity.mean((-2, -1))
+    excess = image.mean(-1) - level
+    if valid is not None:
+        excess = jnp.where(valid, excess, 0)
+    if window is None or window > min(excess.shape[-2:]):
+        distance = excess.mean((-2, -1))
     else:
-        means = block_means(intensity, window)
-    distance = means - level
+        distance = block_means(excess, window)
     return (jnp.abs(distance) if form == "absolute" else distance**2).mean()
 
 

@@ -27,11 +27,11 @@ def moving_tracks(split: Split, backdrop: Backdrop, most: int) -> Tracks:
         most: how many tracks there may be; the longest ones are preferred.
     """
     flows = neighbour_flows(split)
-    chosen = _surely_moving(find_tracks(split, flows, backdrop.depths.still), backdrop, most)
+    chosen = surely_moving(find_tracks(split, flows, backdrop.depths.still), backdrop, most)
     return until_rest(from_rest(chosen, flows, split, backdrop), split, backdrop)
 
 
-def _surely_moving(tracks: Tracks, backdrop: Backdrop, most: int) -> Tracks:
+def surely_moving(tracks: Tracks, backdrop: Backdrop, most: int) -> Tracks:
     """The tracks that are long enough and surely move, the longest ones first.
 
     They are seen to move in enough of their frames, and leave the place where their first point, taken as static, would
@@ -55,6 +55,8 @@ def _deviations(
 ) -> Float[np.ndarray, "C N"]:
     """Pixels from observations to where others, taken as static, would appear in the same frame.
 
+    They are infinite where the camera has passed by the static point, and NaN where its depth is not known.
+
     Args:
         tracks: all observations.
         first: those that are taken as static, at each of C candidates of their depth, some of which may be NaN.
@@ -66,7 +68,8 @@ def _deviations(
     for still in backdrop.depths.still:
         world = unprojected(cameras, frames[first], pixels[first], depths_at(still, frames[first], pixels[first]))
         static, _ = project_points(world, cameras.viewmat[frames[then]], cameras.K[frames[then]])
-        deviations.append(np.linalg.norm(pixels[then] - static, axis=-1))
+        behind = np.isnan(static).any(-1) & np.isfinite(world).all(-1)
+        deviations.append(np.where(behind, np.inf, np.linalg.norm(pixels[then] - static, axis=-1)))
     return np.array(deviations)
 
 

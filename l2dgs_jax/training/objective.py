@@ -78,9 +78,10 @@ def objective(
         own = tone_curves.of_frames(params.curves, batch.frames)
         images = images._replace(lowlight=tone_curves.darkened(images.welllit, own))
     images = images._replace(lowlight=exposed(images.lowlight, params.exposures, batch.frames))
-    target, counted = targets(batch, images.lowlight)
+    lowlight, target, counted = compared(batch, images.lowlight)
+    images = images._replace(lowlight=lowlight)
     measured = output._replace(images=images, depth=output.depth / length_unit(state.scene.extent, config.model))
-    loss, terms = losses.total(measured, target, cfg, eta, exponent_target(config))
+    loss, terms = losses.total(measured, target, cfg, eta, exponent_target(config), batch.valid)
     others = size_terms(scene, config, moving) | curve_terms(params.curves, batch, cfg)
     if moving:
         smoothness, time_smoothness, time_l1 = hexplane.regularisers(params.hexplane)
@@ -92,7 +93,7 @@ def objective(
         others["depth_input"] = (cfg.depth_input, lambda: depth_disagreement(output.depth, output.alpha, depths))
     other, values = losses.weighted_sum(others)
     loss, terms = loss + other, terms | values
-    squares = jnp.mean(jnp.square(jax.lax.stop_gradient(images.lowlight) - target))
+    squares = jnp.mean(jnp.square(jax.lax.stop_gradient(lowlight) - target))
     mse = devices.mean_over(squares, axis) / devices.mean_over(counted, axis)
     report = StepReport(loss, terms, -10 * jnp.log10(mse), output.pairs, output.overflow, jnp.isfinite(loss))
     return loss, (report, output.radii)
@@ -155,14 +156,15 @@ def exposed(
     return lowlight * jnp.exp(exposures - exposures.mean(0, keepdims=True))[frames][:, None, None]
 
 
-def targets(
+def compared(
     batch: Batch, estimate: Float[Array, "V H W 3"]
-) -> tuple[Float[Array, "V H W 3"], Float[Array, ""] | float]:
-    """What the low-light estimate is compared with, and the share of pixels that count.
+) -> tuple[Float[Array, "V H W 3"], Float[Array, "V H W 3"], Float[Array, ""] | float]:
+    """The low-light estimate, what it is compared with, and the share of pixels that count.
 
-    Where pixels are not valid the estimate is compared with itself, held constant: nothing can be learned there.
+    Where pixels are not valid, both are the estimate, held constant: nothing can be learned there.
     """
     if batch.valid is None:
-        return batch.images, 1.0
-    target = jnp.where(batch.valid[..., None], batch.images, jax.lax.stop_gradient(estimate))
-    return target, jnp.maximum(batch.valid.mean(dtype=target.dtype), 1e-6)
+        return estimate, batch.images, 1.0
+    valid, constant = batch.valid[..., None], jax.lax.stop_gradient(estimate)
+    share = batch.valid.mean(dtype=estimate.dtype)
+    return jnp.where(valid, estimate, constant), jnp.where(valid, batch.images, constant), share

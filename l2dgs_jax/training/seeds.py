@@ -74,16 +74,17 @@ def _depths(
     others = ~shows_background | (share_in_track(tracks, np.isnan(depths)) > 0)
     if np.isfinite(depths[others]).any():
         moving = Tracks(*(x[others] for x in tracks))
-        focal_length, height = float(backdrop.cameras.K[:, 0, 0].mean()), split.images.shape[1]
+        focal_x, focal_y = backdrop.cameras.K[:, [0, 1], [0, 1]].mean(0).tolist()
+        height = split.images.shape[1]
         foreground = ~background[others]
         below = just_below(moving, foreground)
         feet = find_feet(moving, foreground, below, height)
         frames = moving.frames[feet]
-        soles = find_soles(frames, moving.pixels[feet], is_background, focal_length, height)
+        soles = find_soles(frames, moving.pixels[feet], is_background, focal_y, height)
         foot = np.full(len(feet), np.nan)
         foot[feet] = floor_depths(backdrop, frames, soles)
         sights = _sights(moving, backdrop, depths[others], foot, given[others])
-        depths[others] = shared_depths(moving, sights, below, focal_length)
+        depths[others] = shared_depths(moving, sights, below, focal_x)
     return depths
 
 

@@ -22,6 +22,7 @@ from l2dgs_jax.cameras.epipolar import (
 from l2dgs_jax.cameras.flow import brightened, matcher, pixel_indices
 from l2dgs_jax.cameras.geometry import camera_centres, pixel_rays, points_inside
 from l2dgs_jax.data.dataset import Split
+from l2dgs_jax.data.stacks import evenly_spread
 from l2dgs_jax.runtime.prefetch import prefetch
 from l2dgs_jax.types import Camera
 
@@ -97,7 +98,7 @@ def depth_maps(points: Float[np.ndarray, "P 3"], split: Split) -> list[DepthMap]
             inverse[~split.valid[frame]] = np.nan
         return DepthMap(viewmat, K, inverse)
 
-    frames = np.unique(np.linspace(0, len(greys) - 1, MAX_FRAMES).round().astype(int))
+    frames = evenly_spread(len(greys), MAX_FRAMES)
     in_time = frames[np.argsort(cameras.time[frames], kind="stable")]  # so that cached flow is used again
     return [*prefetch(depths_of, in_time.tolist())]
 
@@ -190,19 +191,16 @@ def _frames_to_match(
         return []
     instants = np.unique(cameras.time, return_inverse=True)[1].reshape(-1)
     offsets = instants - instants[frame]
+    geometry = epipolar_geometry(cameras, frame, range(len(instants)))
+    ends, at_infinity = project(geometry, seen, 1 / depth), project(geometry, seen, 0 * depth)
+    shifts = np.median(np.linalg.norm(ends - seen, axis=-1), axis=-1)
+    parallaxes = np.median(np.linalg.norm(ends - at_infinity, axis=-1), axis=-1)
     chosen: set[int] = set()
     for side in (offsets <= 0, offsets >= 0):
-        others, missing = np.flatnonzero(side), np.array(PARALLAXES)
-        for other in others[np.argsort(np.abs(offsets[others]), kind="stable")].tolist():
-            geometry = epipolar_geometry(cameras, frame, other)
-            ends = project(geometry, seen, 1 / depth)
-            shift = np.median(np.linalg.norm(ends - seen, axis=-1))
-            parallax = np.median(np.linalg.norm(ends - project(geometry, seen, 0 * depth), axis=-1))
-            if shift < max_shift and parallax >= missing[0]:
-                chosen.add(other)
-                missing = missing[missing > parallax]
-                if not len(missing):
-                    break
+        usable = np.flatnonzero(side & (shifts < max_shift))
+        nearest = usable[np.argsort(np.abs(offsets[usable]), kind="stable")]
+        enough = parallaxes[nearest] >= np.array(PARALLAXES)[:, None]
+        chosen.update(nearest[enough.argmax(-1)[enough.any(-1)]].tolist() if len(nearest) else ())
     return sorted(chosen)
 
 

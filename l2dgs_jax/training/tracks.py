@@ -93,8 +93,6 @@ def find_tracks(split: Split, flows: Flows, depths: Float32[np.ndarray, "C F h w
         static = [project(geometry, pixels, inverse).astype(np.float32) for inverse in inverse_depths]
         flow = flows.displacements[frame, 0].astype(np.float32)
         deviations, moves = _moving(greys[frame], greys[following], static, pixels + flow)
-        if split.valid is not None:
-            moves &= split.valid[frame]
         fresh = grid[_at(moves, grid) & ~np.isin(_cells(grid, width), _cells(heads.pixels, width))]
         heads = _joined([heads, _Heads(count + np.arange(len(fresh)), fresh, np.zeros(len(fresh)))])
         count += len(fresh)

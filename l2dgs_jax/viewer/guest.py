@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from l2dgs_jax.cameras import select_camera
 from l2dgs_jax.data import Dataset
 from l2dgs_jax.data.images import to_bytes
+from l2dgs_jax.data.stacks import evenly_spread
 from l2dgs_jax.types import RenderOutput
 from l2dgs_jax.viewer import ladder
 from l2dgs_jax.viewer.ladder import Size
@@ -138,7 +139,7 @@ class Guest:
     def _show_frusta(self) -> None:
         if self._panel.frusta.value:
             count = len(self._dataset.train.names)
-            chosen = np.unique(np.linspace(0, count - 1, min(count, MAX_FRUSTA)).round().astype(int))
+            chosen = evenly_spread(count, MAX_FRUSTA)
             self._frusta = [self._frustum(int(index)) for index in chosen]
         else:
             for frustum in self._frusta:

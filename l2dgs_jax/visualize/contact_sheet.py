@@ -5,6 +5,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from l2dgs_jax.data.images import to_bytes
+from l2dgs_jax.data.stacks import evenly_spread
 from l2dgs_jax.runs.pictures import Output
 from l2dgs_jax.runs.run import Run
 from l2dgs_jax.visualize import display
@@ -36,7 +37,7 @@ def contact_sheet(run: Run, rows: int = 4) -> UInt8[np.ndarray, "H W 3"]:
     held_out = len(dataset.test.names) > 0
     split = dataset.test if held_out else dataset.train
     in_time = np.argsort(split.cameras.time, kind="stable")
-    chosen = in_time[np.unique(np.linspace(0, len(in_time) - 1, rows).round().astype(int))].tolist()
+    chosen = in_time[evenly_spread(len(in_time), rows)].tolist()
     renderer = run.renderer()
     outputs = [jax.device_get(renderer(split.camera(i))) for i in chosen]
 

@@ -5,10 +5,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import jax
-import numpy as np
 
 from l2dgs_jax.cameras import select_camera
 from l2dgs_jax.cameras.paths import space_time_path
+from l2dgs_jax.data.stacks import evenly_spread
 from l2dgs_jax.runs.pictures import Output
 from l2dgs_jax.runs.run import Run
 from l2dgs_jax.runs.shots import DEFAULT_FPS
@@ -83,5 +83,5 @@ def sampled_ranges(
     if not set(kinds) & set(display.COLOR_MAPPED):
         return {}
     renderer = run.renderer(*size or (None, None))
-    chosen = np.unique(np.linspace(0, len(cameras.time) - 1, RANGE_VIEWS).round().astype(int))
+    chosen = evenly_spread(len(cameras.time), RANGE_VIEWS)
     return display.ranges([jax.device_get(renderer(select_camera(cameras, int(i)))) for i in chosen])

@@ -50,6 +50,7 @@ def test_static_points_project_exactly_and_have_no_residual(scale):
     geometries = [epipolar_geometry(cameras, 0, i) for i in (1, 2, 3)]
     for geometry, truth in zip(geometries, truths, strict=True):
         np.testing.assert_allclose(project(geometry, pixels, 1 / depths), truth, atol=1e-9)
+    np.testing.assert_allclose(project(stacked(geometries), pixels, 1 / depths), truths, atol=1e-9)
     residuals = static_residuals(stacked(geometries), pixels, truths, (0.1 / scale, 1 / scale))
     assert residuals.shape == (4, 3, 20)
     assert residuals.max() < 1e-8

@@ -10,7 +10,7 @@ from scenes import write_nerfies
 
 from l2dgs_jax import data
 from l2dgs_jax.config import PRESETS
-from l2dgs_jax.data.stacks import MappedArray, pixel_mean, stacked
+from l2dgs_jax.data.stacks import MappedArray, evenly_spread, nan_median, pixel_mean, stacked
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.model.observation import observed_colors
 from l2dgs_jax.training import resolve
@@ -142,3 +142,17 @@ def test_a_full_disk_is_reported_in_one_sentence(scene, temporary_folder, monkey
     monkeypatch.setattr(tempfile, "tempdir", str(temporary_folder / "nonsuch"))
     with pytest.raises(UserError, match=r"nonsuch: cannot hold .* expected TMPDIR"):
         data.load_dataset(scene, frame_memory=0.0)
+
+
+def test_indices_are_evenly_spread():
+    assert evenly_spread(0, 3).tolist() == []
+    assert evenly_spread(2, 3).tolist() == [0, 1]
+    assert evenly_spread(10, 4).tolist() == [0, 3, 6, 9]
+
+
+def test_nan_median_is_that_of_numpy():
+    rng = np.random.default_rng(0)
+    values = np.where(rng.random((7, 200, 3)) < 0.4, np.nan, rng.random((7, 200, 3)))
+    values[:, 0] = np.nan
+    np.testing.assert_array_equal(nan_median(values)[0], np.full(3, np.nan))
+    np.testing.assert_allclose(nan_median(values)[1:], np.nanmedian(values[:, 1:], axis=0))

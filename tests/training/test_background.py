@@ -87,3 +87,16 @@ def test_a_few_frames_tell_what_the_background_looks_like(frames, monkeypatch):
     monkeypatch.setattr(background, "MAX_FRAMES", frames)
     split, tracks = seen()
     assert found(split, tracks)["shadow"] > 0.95
+
+
+def test_a_long_clip_is_compared_part_by_part(monkeypatch):
+    monkeypatch.setattr(background, "CLIP_PART", 6)
+    split, tracks = seen()
+    assert found(split, tracks)["shadow"] > 0.95
+    images = np.array(split.images)
+    images[6:] = np.roll(images[6:], 16, axis=2)  # the camera has gone elsewhere
+    moved = dataclasses.replace(split, images=images)
+    places = np.where((tracks.frames >= 6)[:, None], (tracks.pixels + np.array([16, 0])) % SIDE, tracks.pixels)
+    assert found(moved, tracks._replace(pixels=places))["shadow"] > 0.95
+    monkeypatch.setattr(background, "CLIP_PART", 100)
+    assert found(moved, tracks._replace(pixels=places))["shadow"] < 0.9

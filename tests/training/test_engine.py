@@ -13,7 +13,7 @@ from l2dgs_jax.model.rendering import Renderer
 from l2dgs_jax.runs import checkpoints
 from l2dgs_jax.runs.checkpoints import Checkpoint
 from l2dgs_jax.runtime.capacity import next_capacity
-from l2dgs_jax.training import engine, initial_state, objective, step
+from l2dgs_jax.training import engine, initial_state, losses, objective, step
 from l2dgs_jax.training.batching import load_batch
 from l2dgs_jax.training.state import with_capacity
 from l2dgs_jax.types import Camera
@@ -107,21 +107,31 @@ def test_nothing_is_learned_from_pixels_outside_the_valid_mask(dataset):
     config = tiny()
     valid = np.random.default_rng(0).random((FRAMES, HEIGHT, WIDTH)) < 0.7
     estimate = jax.random.uniform(jax.random.key(0), (2, HEIGHT, WIDTH, 3))
-    states, targets = [], []
+    states, compared = [], []
     for wrong in (0.0, 1.0):
         images = np.where(valid[..., None], dataset.train.images, wrong).astype(np.float16)
         split = dataclasses.replace(dataset.train, images=images, valid=valid)
         states.append(initial_state(dataclasses.replace(dataset, train=split), config))
         batch = load_batch(split, np.array([1, 4]))
         batch = batch._replace(images=jnp.asarray(batch.images, float))
-        targets.append(objective.targets(batch, estimate))
-        assert jnp.all(jax.grad(lambda x, batch=batch: objective.targets(batch, x)[0].sum())(estimate) == 0)
+        compared.append(objective.compared(batch, estimate))
+
+        def photometric(estimate, batch=batch):
+            prediction, target, _ = objective.compared(batch, estimate)
+            l1 = losses.photometric_l1(prediction, target, "raw", 1.0, 0.01)
+            return l1 + losses.photometric_ssim(prediction, target, 1.0, 0.01)
+
+        gradient = jax.grad(photometric)(estimate)
+        assert jnp.all(gradient[~batch.valid] == 0)
+        assert jnp.all(gradient[batch.valid] != 0)
     assert_equal_states(*states)
-    assert_equal_states(*targets)
+    assert_equal_states(*compared)
+    prediction, target, share = compared[0]
     seen = valid[[1, 4]]
-    np.testing.assert_array_equal(targets[0][0][~seen], estimate[~seen])
-    np.testing.assert_array_equal(targets[0][0][seen], dataset.train.images[[1, 4]][seen])
-    np.testing.assert_allclose(targets[0][1], seen.mean())
+    np.testing.assert_array_equal(prediction, estimate)
+    np.testing.assert_array_equal(target[~seen], estimate[~seen])
+    np.testing.assert_array_equal(target[seen], dataset.train.images[[1, 4]][seen])
+    np.testing.assert_allclose(share, seen.mean())
 
 
 def test_a_step_measures_only_the_pixels_of_the_valid_mask(dataset):

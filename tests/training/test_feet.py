@@ -77,3 +77,8 @@ def test_a_foot_without_an_end_in_view_keeps_its_place(row):
 def test_there_may_be_no_feet():
     is_background = lambda frames, _: np.zeros(len(frames), bool)
     assert find_soles(np.zeros(0, int), np.zeros((0, 2)), is_background, 200.0, HEIGHT).shape == (0, 2)
+
+
+def test_frames_may_be_tiny():
+    feet = np.array([[5.0, 5.0]])
+    assert_allclose(find_soles(np.zeros(1, int), feet, lambda frames, _: np.ones(len(frames), bool), 3.0, 12), feet)

@@ -171,6 +171,16 @@ def test_exposure_is_eq_11(window, form):
     grads_agree(lambda image: losses.exposure(image, 0.6, window, form), image)
 
 
+@pytest.mark.parametrize("window", [3, None])
+def test_exposure_is_that_of_valid_pixels(window):
+    image, valid = uniform(2, V, H, W, 3), uniform(3, V, H, W) < 0.6
+    filled = jnp.where(valid[..., None], image, 0.6)
+    masked = lambda image: losses.exposure(image, 0.6, window, "squared", valid)
+    close(masked(image), expected_exposure(np.asarray(filled), 0.6, window, "squared"))
+    assert jnp.all((jax.grad(masked)(image) != 0).any(-1) <= valid)
+    grads_agree(masked, image)
+
+
 def test_exposure_leaves_out_incomplete_blocks():
     image = jnp.full((V, H, W, 3), 0.6).at[:, 6:].set(1.0)
     assert losses.exposure(image, 0.6, 3, "absolute") < 1e-12 < losses.exposure(image, 0.6, None, "absolute")

@@ -4,10 +4,12 @@ import dataclasses
 
 import numpy as np
 import pytest
-from moving_squares import FRAMES, SIDE, backdrop, seen
+from moving_squares import FRAMES, SIDE, K, backdrop, seen
 
+from l2dgs_jax.cameras.geometry import project_points
+from l2dgs_jax.training.backdrop import DEPTH_CELL, Backdrop, Cameras, Depths
 from l2dgs_jax.training.flows import Flows
-from l2dgs_jax.training.moving_tracks import from_rest, until_rest
+from l2dgs_jax.training.moving_tracks import from_rest, surely_moving, until_rest
 from l2dgs_jax.training.tracks import Tracks, by_track
 
 SPLIT, ALL = seen()
@@ -101,3 +103,19 @@ def test_a_track_is_followed_back_only_as_far_as_it_differs_from_the_background(
     begun.pixels[0, 0] = begun.pixels[1, 0] - 1.2
     followed = from_rest(begun, flows(6), split, backdrop(split))
     assert followed.frames.tolist() == list(range(4, FRAMES))
+
+
+@pytest.mark.parametrize("step", [0.1, 0.3])
+def test_what_moves_is_found_if_the_camera_walks_past_static_things(step):
+    frames = np.arange(FRAMES * 2)
+    viewmat = np.tile(np.eye(4), (len(frames), 1, 1))
+    viewmat[:, 2, 3] = -step * frames
+    Ks = np.tile(K, (len(frames), 1, 1))
+    person = np.stack([0.03 * frames, 0 * frames, 2 + step * frames], axis=-1)  # always two units ahead
+    pixels, _ = project_points(person, viewmat, Ks)
+    track = Tracks(0 * frames, frames, pixels, np.ones(len(frames), bool))
+    cells = SIDE // DEPTH_CELL
+    candidates = np.array([3.0, 4.0, 6.0, 10.0], np.float32)[:, None, None, None]
+    depths = Depths(np.broadcast_to(candidates, (4, len(frames), cells, cells)), None)
+    cameras = Cameras(viewmat, Ks, frames / len(frames))
+    assert len(surely_moving(track, Backdrop(cameras, depths, None), most=10).frames) == len(frames)

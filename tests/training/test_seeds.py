@@ -287,3 +287,12 @@ def test_members_with_fewer_paths_than_others_get_unused_ones(tracked):
         np.testing.assert_array_equal(after.paths[:few], before.paths)
         assert after.paths.shape[0] == many
         assert not after.paths[few:].any()
+
+
+def test_the_outline_of_what_is_valid_does_not_move():
+    split, _ = filmed(block=False)
+    row, column = np.ogrid[:HEIGHT, :WIDTH]
+    lens = np.hypot(row - HEIGHT / 2, column - WIDTH / 2) < 0.45 * HEIGHT
+    images = np.where(lens[..., None], split.images, 0).astype(np.float16)
+    valid = np.broadcast_to(lens, images.shape[:3]).copy()
+    assert not len(find_seeds(surfaces(), dataclasses.replace(split, images=images, valid=valid), MANY).points)

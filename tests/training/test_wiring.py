@@ -41,9 +41,9 @@ def spied_objective(dataset, monkeypatch, config, moving):
         seen["sh_degree"] = options["sh_degree"]
         return render(*arguments, **options)
 
-    def spy_on_total(output, target, cfg, eta, exponent_target):
+    def spy_on_total(output, target, cfg, eta, exponent_target, valid):
         seen.update(eta=eta, exponent_target=exponent_target)
-        return total(output, target, cfg, eta, exponent_target)
+        return total(output, target, cfg, eta, exponent_target, valid)
 
     monkeypatch.setattr(objective, "render", spy_on_render)
     monkeypatch.setattr(losses, "total", spy_on_total)
@@ -153,6 +153,15 @@ def test_a_run_has_its_stages_views_and_densifications_at_the_right_steps(datase
     assert journal.growths == [3, 6, COARSE + 3, COARSE + 6]  # counted from the start of each stage
     assert journal.growths_left == [2, 1, 2, 1]
     assert states[COARSE + FINE].step == COARSE + FINE
+
+
+@pytest.mark.parametrize("stage", ["coarse", "fine"])
+def test_no_densification_follows_the_last_step(dataset, journal, stage):
+    density = DensityConfig(start=2, stop=100, interval=3)
+    steps = {"coarse_steps": 9, "fine_steps": 0} if stage == "coarse" else {"coarse_steps": 6, "fine_steps": 6}
+    run(dataset, dataclasses.replace(config_of(), density=density, **steps))
+    assert journal.growths == ([3, 6] if stage == "coarse" else [3, 6, 9])
+    assert journal.growths_left == ([2, 1] if stage == "coarse" else [2, 1, 1])
 
 
 def test_densification_that_stops_before_it_starts_never_happens(dataset, journal):

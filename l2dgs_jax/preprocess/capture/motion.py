@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
 from l2dgs_jax.cameras.flow import match, optical_flow
+from l2dgs_jax.data.stacks import evenly_spread
 from l2dgs_jax.preprocess.capture.frames import shrink
 
 WORKING_SIZE = 512  # longer side of the pictures on which flow is computed, pixels
@@ -53,7 +54,7 @@ def camera_shift(pictures: Sequence[UInt8[np.ndarray, "h w"]], samples: int = 5)
 
     The median ignores objects that move in front of a background that fills most of the picture.
     """
-    chosen = [pictures[i] for i in np.unique(np.linspace(0, len(pictures) - 1, samples).round().astype(int))]
+    chosen = [pictures[i] for i in evenly_spread(len(pictures), samples)]
     pairs = ((a, b) for i, a in enumerate(chosen) for b in chosen[i + 1 :])
     return max((float(np.median(np.linalg.norm(_flow(a, b)[_textured(a)], axis=-1))) for a, b in pairs), default=0.0)
 

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from scipy.spatial.distance import pdist
 
+from l2dgs_jax.data.stacks import evenly_spread
 from l2dgs_jax.preprocess.capture import structure
 from l2dgs_jax.preprocess.capture.structure import Workplace
 from l2dgs_jax.visualize.sheet import GAP, cell, text_strip
@@ -103,7 +104,7 @@ def contact_sheet(
         unregistered: reasons why frames have no pose, by name; these frames are all shown, of the others only some.
     """
     points = {} if model is None else {v.name: _observed(v) for v in map(model.image, model.reg_image_ids())}
-    spread = np.linspace(0, len(names) - 1, min(len(names), MOST_CELLS)).round().astype(int).tolist()
+    spread = evenly_spread(len(names), MOST_CELLS).tolist()
     shown = sorted({*spread, *(i for i, name in enumerate(names) if name in unregistered)})
     cells = []
     for i in shown:

@@ -16,7 +16,7 @@ from tqdm import tqdm
 from l2dgs_jax import metrics
 from l2dgs_jax.data.dataset import Dataset, Split
 from l2dgs_jax.data.images import to_bytes
-from l2dgs_jax.data.stacks import MappedArray, stacked
+from l2dgs_jax.data.stacks import MappedArray, evenly_spread, stacked
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.preprocess.lowlight import darkening, weights
 from l2dgs_jax.visualize.sheet import sheet
@@ -147,7 +147,7 @@ def contact_sheet(dataset: Dataset, rows: int = 4) -> UInt8[np.ndarray, "H W 3"]
     split = dataset.train
     assert split.welllit is not None
     in_time = np.argsort(split.cameras.time, kind="stable")
-    chosen = in_time[np.unique(np.linspace(0, len(in_time) - 1, rows).round().astype(int))].tolist()
+    chosen = in_time[evenly_spread(len(in_time), rows)].tolist()
     gain = float(split.welllit[chosen].mean(dtype=np.float64) / max(split.images[chosen].mean(dtype=np.float64), 1e-6))
     lines = [
         (

@@ -16,7 +16,7 @@ from l2dgs_jax.data.color import brightening_exponent
 from l2dgs_jax.data.dataset import Dataset, Original
 from l2dgs_jax.data.images import to_bytes, write_image
 from l2dgs_jax.data.lens import distorted
-from l2dgs_jax.data.stacks import MappedArray, stacked
+from l2dgs_jax.data.stacks import MappedArray, evenly_spread, stacked
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.preprocess.motion_masks.detection import moving_masks
 from l2dgs_jax.types import Camera
@@ -87,7 +87,7 @@ def preview(dataset: Dataset, masks: Bool[np.ndarray, "F H W"]) -> UInt8[np.ndar
     chosen: list[int] = []
     for part in (~held_out, held_out):
         frames = np.flatnonzero(part)[np.argsort(cameras.time[part], kind="stable")]
-        chosen += frames[np.unique(np.linspace(0, len(frames) - 1, PREVIEW_ROWS // 2).round().astype(int))].tolist()
+        chosen += frames[evenly_spread(len(frames), PREVIEW_ROWS // 2)].tolist()
 
     exponent = brightening_exponent(float(images[chosen].mean(dtype=np.float64)), PREVIEW_LEVEL)
     rows = []
