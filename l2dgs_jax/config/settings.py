@@ -324,6 +324,9 @@ class Config:
             ("--downscale", self.downscale, 1),
             ("--density.interval", self.density.interval, 1),
             ("--loss.exposure-window", window, 1),
+            ("--model.hidden", model.hidden, 1),
+            ("--model.plane-channels", model.plane_channels, 1),
+            ("--model.plane-scales", min(model.plane_scales, default=0), 1),
             ("--model.plane-size", model.plane_size, 2),
             ("--model.time-size", model.time_size, 2),
         ):
@@ -333,6 +336,7 @@ class Config:
             ("--seed", self.seed, 0 <= self.seed < 2**31, "a whole number from 0 below 2^31"),
             ("--inbetweens", self.inbetweens, 0 <= self.inbetweens < 1, "at least 0 and less than 1"),
             ("--drop", self.drop, 0 <= self.drop < 1, "at least 0 and less than 1"),
+            ("--loss.eps", self.loss.eps, self.loss.eps >= 0, "at least 0"),
             ("--optim.cooldown", self.optim.cooldown, 0 <= self.optim.cooldown <= 1, "from 0 to 1"),
             ("--model.shut-gates", model.shut_gates, 0 <= model.shut_gates < 1, "at least 0 and less than 1"),
             ("--model.box-rim", model.box_rim, 0 <= model.box_rim < 1, "at least 0 and less than 1"),

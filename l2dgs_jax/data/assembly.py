@@ -41,6 +41,9 @@ class Frame:
         image: the low-light picture.
         alpha: meaning of its alpha channel: which pixels count ("validity"), or how much of each pixel the scene covers
             in front of a black background ("coverage").
+        upright: whether the picture is turned as its EXIF orientation says; otherwise the camera is that of its stored
+            rows and columns.
+        mask: a picture that is white where pixels count, if there is one.
     """
 
     name: str
@@ -52,6 +55,8 @@ class Frame:
     time: float
     image: Picture
     alpha: Literal["validity", "coverage"] = "validity"
+    upright: bool = True
+    mask: Picture | None = None
 
 
 def assemble(
@@ -88,8 +93,9 @@ def assemble(
     full = _common_size(frames)
     if min(full) < downscale:
         raise UserError(f"--downscale {downscale}: expected at most {min(full)}, the images' shorter side")
-    if _check_pictures([frame.image for frame in frames], full):
+    if _check_pictures([frame.image for frame in frames], full, frames[0].upright):
         notes = (*notes, LINEAR_NOTE)
+    _check_pictures([frame.mask for frame in frames if frame.mask], full)
     width, height = full[0] // downscale, full[1] // downscale
     # Bytes per pixel; masks, which take a sixth of what pictures take, are not counted.
     size = 6 * (1 + (folder / "well").is_dir()) + 4 * any((folder / kind).is_dir() for kind in depth_maps.FOLDERS)
@@ -101,6 +107,10 @@ def assemble(
             "distances in disparity/"
         )
     held_out, test_notes = _SplitReader(folder, "val", test, width, height, downscale, in_file).read()
+    for kind, found in (("well", [learned.welllit, held_out.welllit]), ("mask", [learned.masks, held_out.masks])):
+        if (folder / kind).is_dir() and all(x is None for x in found) and not any(kind in note for note in train_notes):
+            example = f"{kind}/1x/{frames[0].name}.png"
+            notes = (*notes, f"{kind}/ has no picture that is called like a frame, such as {example}: not used")
     return Dataset(
         name=folder.resolve().name,
         width=width,
@@ -123,11 +133,13 @@ def _common_size(frames: Sequence[Frame]) -> tuple[int, int]:
     return first.size
 
 
-def _check_pictures(pictures: Sequence[Picture], full: tuple[int, int]) -> bool:
+def _check_pictures(pictures: Sequence[Picture], full: tuple[int, int], upright: bool = True) -> bool:
     """Check every picture's size against the cameras' full size; returns whether any picture holds linear light."""
     headers = list(_parallel(lambda picture: images.read_header(picture.path), pictures))
     for picture, header in zip(pictures, headers, strict=True):
-        _check_size(picture, header.size, full, " once turned as its EXIF orientation says" if header.turned else "")
+        swapped = header.orientation >= 5
+        size = header.size if upright or not swapped else header.size[::-1]
+        _check_size(picture, size, full, " once turned as its EXIF orientation says" if upright and swapped else "")
     return any(header.linear for header in headers)
 
 
@@ -214,7 +226,7 @@ class _SplitReader:
         if frame.alpha == "coverage":
             image = images.read_over_black(frame.image.path)
         else:
-            image, alpha = images.read_image_and_alpha(frame.image.path)
+            image, alpha = images.read_image_and_alpha(frame.image.path, frame.upright)
         counts = np.ones((self.height, self.width), bool)
         # A pixel counts if everything that it was interpolated from does.
         inside = seen((image.shape[1], image.shape[0]), scale_intrinsics(frame.K, scale), frame.lens)
@@ -222,6 +234,9 @@ class _SplitReader:
             counts = counts & (self._shrink(inside[..., None].astype(np.float32), scale)[..., 0] > 0.999)
         if alpha is not None:
             counts = counts & (self._fit(frame, (alpha > 0.5).astype(np.float32), scale)[..., 0] > 0.999)
+        if frame.mask:
+            white = (images.read_image(frame.mask.path)[..., :1] > 0.5).astype(np.float32)
+            counts = counts & (self._fit(frame, white, frame.mask.scale)[..., 0] > 0.999)
         return self._fit(frame, image, scale).astype(np.float16), counts
 
     def _truth(self, kind: str, as_mask: bool, prefix: str = "") -> tuple[Any, str]:
@@ -233,8 +248,9 @@ class _SplitReader:
         _check_pictures(found, self.frames[0].size)
 
         def read_one(index: int) -> Float16[np.ndarray, "H W 3"] | Bool[np.ndarray, "H W"]:
-            picture = found[index]
-            image = self._fit(self.frames[index], images.read_image(picture.path), picture.scale).astype(np.float16)
+            picture, frame = found[index], self.frames[index]
+            read = images.read_over_black if frame.alpha == "coverage" else images.read_image
+            image = self._fit(frame, read(picture.path), picture.scale).astype(np.float16)
             return image.mean(-1) > 0.5 if as_mask else image
 
         read_all = _parallel(read_one, range(len(self.frames)))

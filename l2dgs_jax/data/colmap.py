@@ -66,7 +66,8 @@ def read(folder: Path, downscale: int, held_out: str, frame_memory: float) -> Da
             if not (K[0, 0] > 0 and K[1, 1] > 0):
                 raise UserError(f"{model}: camera {image.camera} has no positive focal length; expected one")
             source, size = f"{model}, camera {image.camera}", (camera.width, camera.height)
-            described.append(Frame(name, source, image.viewmat, K, lens, size, times[name], picture))
+            # COLMAP ignores EXIF's orientation.
+            described.append(Frame(name, source, image.viewmat, K, lens, size, times[name], picture, upright=False))
         return described
 
     others = sorted(path.name for path in (folder / "sparse").iterdir() if path.is_dir() and path != model)
@@ -111,11 +112,17 @@ def pinhole_and_lens(camera: ModelCamera) -> tuple[Float64[np.ndarray, "3 3"], L
 
 
 def _root(folder: Path, names: list[str]) -> Path:
-    """The folder that the images' names are relative to: `images`, or another one that holds the first image."""
+    """The folder that the images' names are relative to: `images`, or else the one that holds all of them."""
     usual = folder / "images"
-    for candidate in (usual, folder, *sorted(path for path in folder.iterdir() if path.is_dir())):
-        if candidate.is_dir() and names[0] in by_name(candidate):
-            return candidate
-    if not usual.is_dir():
+    if usual.is_dir():
+        return usual
+    others = (folder, *sorted(path for path in folder.iterdir() if path.is_dir()))
+    fitting = [other for other in others if {*names} <= by_name(other).keys()]
+    if not fitting:
         raise UserError(f"{usual}: no such folder; expected the pictures that the model was made from")
-    return usual
+    if len(fitting) > 1:
+        raise UserError(
+            f"{folder}: {fitting[0].name}/ and {fitting[1].name}/ both hold a picture for every image of the model; "
+            "expected those that it was made from in images/"
+        )
+    return fitting[0]

@@ -62,7 +62,10 @@ def read(path: Path, inverse: bool) -> Float32[np.ndarray, "h w"]:
         UserError: the file cannot be read or has another shape.
     """
     if path.suffix.lower() == ".png":
-        values = read_image(path)[..., 0]
+        picture = read_image(path)
+        if np.ptp(picture, axis=-1).any():
+            raise UserError(f"{path}: is a coloured picture of depth; expected grey values, or an array in .npy")
+        values = picture[..., 0]
     else:
         values = read_array(path, "depth, shape (H, W) or (H, W, 1)", finite=False)
         if values.ndim not in (2, 3) or values.shape[2:] not in ((), (1,)):

@@ -12,8 +12,9 @@ from jaxtyping import Bool, Float, Float32, Shaped, UInt8
 
 from l2dgs_jax.data.color import linear_to_srgb
 from l2dgs_jax.errors import UserError
-from l2dgs_jax.runtime.files import replacing
+from l2dgs_jax.runtime.files import expect_room, replacing
 
+FILE_OVERHEAD = 2**16  # bytes of a picture's file beside its pixels, at most
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".exr", ".hdr", ".bmp")
 
 
@@ -22,12 +23,12 @@ class Header(NamedTuple):
 
     Attributes:
         size: width and height in pixels, upright.
-        turned: whether its EXIF orientation swaps the two.
+        orientation: EXIF's number, from 1 (stored upright) to 8; from 5 on, width and height are stored swapped.
         linear: whether it holds linear light instead of sRGB values.
     """
 
     size: tuple[int, int]
-    turned: bool
+    orientation: int
     linear: bool
 
 
@@ -43,9 +44,11 @@ def read_image(path: Path) -> Float32[np.ndarray, "H W 3"]:
     return read_image_and_alpha(path)[0]
 
 
-def read_image_and_alpha(path: Path) -> tuple[Float32[np.ndarray, "H W 3"], Float32[np.ndarray, "H W 1"] | None]:
-    """Like `read_image`, with the alpha channel if there is one."""
-    color, alpha, associated, linear = _read(path)
+def read_image_and_alpha(
+    path: Path, upright: bool = True
+) -> tuple[Float32[np.ndarray, "H W 3"], Float32[np.ndarray, "H W 1"] | None]:
+    """Like `read_image`, with the alpha channel if there is one; as it is stored, if not `upright`."""
+    color, alpha, associated, linear = _read(path, upright)
     if alpha is not None and associated:
         color = np.divide(color, alpha, out=color.copy(), where=alpha > 0)
     return _as_srgb(color, linear), alpha
@@ -57,7 +60,9 @@ def read_over_black(path: Path) -> Float32[np.ndarray, "H W 3"]:
     return _as_srgb(color if alpha is None or associated else color * alpha, linear)
 
 
-def _read(path: Path) -> tuple[Float32[np.ndarray, "H W 3"], Float32[np.ndarray, "H W 1"] | None, bool, bool]:
+def _read(
+    path: Path, upright: bool = True
+) -> tuple[Float32[np.ndarray, "H W 3"], Float32[np.ndarray, "H W 1"] | None, bool, bool]:
     """Colour as stored, alpha if any, whether colour is premultiplied by alpha, and whether it is linear light."""
     with closing(_open(path)) as file:
         spec = file.spec()
@@ -65,7 +70,7 @@ def _read(path: Path) -> tuple[Float32[np.ndarray, "H W 3"], Float32[np.ndarray,
         if pixels is None:
             raise UserError(f"{path}: expected a readable picture, but it is damaged ({_reason(file.geterror())})")
         may_be_associated = file.format_name() in ("openexr", "tiff")
-    pixels = _upright(np.asarray(pixels, np.float32), _orientation(spec))
+    pixels = _upright(np.asarray(pixels, np.float32), _orientation(spec) if upright else 1)
     if _is_float(spec) and not np.isfinite(pixels).all():
         raise UserError(f"{path}: holds NaN or infinite values; expected finite colours")
     color = pixels[..., :3] if pixels.shape[-1] >= 3 else np.repeat(pixels[..., :1], 3, axis=-1)
@@ -79,8 +84,9 @@ def _read(path: Path) -> tuple[Float32[np.ndarray, "H W 3"], Float32[np.ndarray,
 
 
 def _as_srgb(color: Float32[np.ndarray, "H W 3"], linear: bool) -> Float32[np.ndarray, "H W 3"]:
-    """Stored colour as sRGB values."""
-    return linear_to_srgb(np.clip(color, 0, 1)) if linear else color
+    """Stored colour as sRGB values in [0, 1]."""
+    clipped = np.clip(color, 0, 1)
+    return linear_to_srgb(clipped) if linear else clipped
 
 
 def read_header(path: Path) -> Header:
@@ -91,9 +97,9 @@ def read_header(path: Path) -> Header:
     """
     with closing(_open(path)) as file:
         spec = file.spec()
-        turned = _orientation(spec) >= 5
-        size = (spec.height, spec.width) if turned else (spec.width, spec.height)
-        return Header(size, turned, _is_linear(spec))
+        orientation = _orientation(spec)
+        size = (spec.height, spec.width) if orientation >= 5 else (spec.width, spec.height)
+        return Header(size, orientation, _is_linear(spec))
 
 
 def write_image(path: Path, image: Shaped[np.ndarray, "H W *C"]) -> None:
@@ -105,6 +111,7 @@ def write_image(path: Path, image: Shaped[np.ndarray, "H W *C"]) -> None:
     pixels = oiio.ImageBuf(np.ascontiguousarray(image))
     pixels.specmod().attribute("oiio:UnassociatedAlpha", 1)
     with replacing(path) as temporary:
+        expect_room(temporary, image.nbytes * 17 // 16 + FILE_OVERHEAD)  # OpenImageIO says nothing if the disk is full
         if not pixels.write(str(temporary)):
             reason = _reason(f"{pixels.geterror()} {oiio.geterror()}")
             raise UserError(f"{path}: cannot be written ({reason}); expected a picture's suffix and a writable folder")

@@ -53,7 +53,7 @@ def read_array(path: Path, what: str, finite: bool = True) -> np.ndarray:
     return values
 
 
-def value(path: Path, content: dict[str, Any], key: str, kind: type) -> Any:
+def value(path: Path | str, content: dict[str, Any], key: str, kind: type) -> Any:
     """The value of a key, which must have the type `kind`.
 
     Raises:

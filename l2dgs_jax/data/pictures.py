@@ -86,11 +86,13 @@ def copies(scene: Path, root: Path, downscale: int, files: Mapping[str, str]) ->
 
 
 def by_name(folder: Path, suffixes: Sequence[str] = SUFFIXES) -> dict[str, list[Path]]:
-    """Picture files, or files with other `suffixes`, by their path within the folder without the suffix."""
+    """Picture files, or files with other `suffixes`, by their path in the folder without suffix; none hidden."""
     files: dict[str, list[Path]] = {}
     for path in sorted(folder.rglob("*")):
-        if path.suffix.lower() in suffixes:
-            files.setdefault(path.relative_to(folder).with_suffix("").as_posix(), []).append(path)
+        inside = path.relative_to(folder)
+        hidden = any(part.startswith(".") for part in inside.parts)  # such as what macOS writes beside files
+        if path.suffix.lower() in suffixes and not hidden:
+            files.setdefault(inside.with_suffix("").as_posix(), []).append(path)
     return files
 
 

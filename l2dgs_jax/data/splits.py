@@ -45,7 +45,12 @@ def hold_out(
     """
     notes: tuple[str, ...] = ()
     if rule == "auto" and own[1]:
-        train, test = own
+        test = list(dict.fromkeys(own[1]))
+        train = [name for name in dict.fromkeys(own[0]) if name not in test]
+        if len(train) < len(own[0]):
+            notes = (
+                f"{source}: {len(own[0]) - len(train)} frames are listed twice; what is held out is not trained on",
+            )
     else:
         rule = default if rule == "auto" else rule
         if rule == "4dgs":
@@ -91,9 +96,14 @@ def lists_beside(folder: Path, names: Sequence[str]) -> Lists:
         UserError: it is malformed or lists frames that the scene does not have.
     """
     path = folder / "dataset.json"
-    if not path.exists() or "train_ids" not in read_json(path, "the lists of frames"):
+    content = read_json(path, "the lists of frames") if path.exists() else {}
+    if not {"train_ids", "val_ids"} & content.keys():
         return NO_LISTS
-    own = lists(folder)[1]
+    if "train_ids" in content:
+        own = lists(folder)[1]
+    else:
+        test = name_list(path, content, "val_ids")
+        own = [name for name in names if name not in test], test
     unknown = sorted({*own[0], *own[1]} - {*names})
     if unknown:
         raise UserError(f"{path}: lists '{unknown[0]}', which the scene does not have; expected the scene's frames")
@@ -104,8 +114,8 @@ def instants(folder: Path, names: Sequence[str]) -> dict[str, float]:
     """The frames' instants in [0, 1].
 
     They come from `metadata.json`: "time", `normalised`, or else "warp_id" or "time_id", scaled to [0, 1]. Without it,
-    they are the last numbers in the names, scaled likewise, if all names have one and they differ; or else the order of
-    the names.
+    they are the numbers in the names (see `numbers_in`), scaled likewise, if these differ; or else the order of the
+    names.
 
     Raises:
         UserError: `metadata.json` is malformed, or has entries for some of the frames only.
@@ -135,8 +145,14 @@ def _spread(values: Float[np.ndarray, " F"]) -> Float[np.ndarray, " F"]:
 
 
 def _from_names(names: Sequence[str]) -> Float[np.ndarray, " F"]:
-    found = [_DIGITS.findall(name) for name in names]
-    numbers = [int(digits[-1][-15:]) for digits in found if digits]
-    if len(numbers) == len(names) and len(set(numbers)) > 1:
-        return np.array(numbers, float)
-    return np.arange(len(names), dtype=float)
+    numbers = numbers_in(names)
+    return np.array(numbers, float) if len(set(numbers)) > 1 else np.arange(len(names), dtype=float)
+
+
+def numbers_in(names: Sequence[str]) -> list[int]:
+    """The number in each name by which most names differ, counted from the end; empty if a name has none.
+
+    Names may also hold the number of a camera or of a take; of those that tell equally many apart, the last one counts.
+    """
+    found = [[int(digits[-15:]) for digits in reversed(_DIGITS.findall(name))] for name in names]
+    return max(map(list, zip(*found, strict=False)), key=lambda numbers: len(set(numbers)), default=[])

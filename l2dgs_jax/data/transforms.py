@@ -2,6 +2,7 @@
 
     transforms.json, or transforms_{train,test,val}.json     frames, cameras (axes right, up, back) and instants
     the pictures that they name   [images_<k>/<name> beside images/<name>, k times smaller]
+    [masks that they name as mask_path, white where pixels count]
     [a point cloud, see `clouds.find`]   [dataset.json]   [metadata.json]   as in the layout of Nerfies
 
 Brackets mark what is optional. Alpha says how much of a pixel the scene covers: pictures are composited over black,
@@ -53,6 +54,7 @@ def read(folder: Path, downscale: int, held_out: str, frame_memory: float) -> Da
     """
     entries, own, ply = _entries(folder)
     names = list(entries)
+    unread = sorted({"depth_file_path"} & {key for _, content, _ in entries.values() for key in content})
     own = own if own[1] else splits.lists_beside(folder, names)
     train, test, notes = splits.hold_out(str(folder), names, own, held_out, default="8")
     times = _times(folder, entries)
@@ -64,6 +66,8 @@ def read(folder: Path, downscale: int, held_out: str, frame_memory: float) -> Da
         cloud = clouds.in_common_box(np.stack([frame.viewmat for frame in frames.values()]), str(folder)), None
         stand_in = f"{clouds.RANDOM_POINTS} random points where its cameras look stand in for one"
         notes = (*notes, f"{folder} has no point cloud: {stand_in}")
+    if unread:
+        notes = (*notes, f"{folder}: '{unread[0]}' is not read; depth belongs into depth/ (docs/data.md)")
     return assemble(
         folder, [frames[n] for n in train], [frames[n] for n in test], *cloud, downscale, frame_memory, notes
     )
@@ -159,7 +163,7 @@ def _listed(path: Path, content: dict[str, Any]) -> dict[str, Entry]:
     for i, frame in enumerate(value(path, content, "frames", list)):
         if not isinstance(frame, dict):
             raise UserError(f"{path}: frame {i} is no JSON object; expected file_path and transform_matrix")
-        picture = _picture(path, value(path, frame, "file_path", str))
+        picture = _picture(path, value(f"{path}, frame {i}", frame, "file_path", str))
         name = _name(path.parent, picture)
         if name in entries:
             raise UserError(
@@ -190,7 +194,9 @@ def _times(folder: Path, entries: dict[str, Entry]) -> dict[str, float]:
     """The frames' own instants, or else those of `splits.instants`."""
     if not any("time" in content for _, content, _ in entries.values()):
         return splits.instants(folder, list(entries))
-    times = np.array([float(numbers(path, content, "time", ())) for path, content, _ in entries.values()])
+    sources = [f"{path}, frame '{name}'" for name, (path, *_) in entries.items()]
+    contents = [content for _, content, _ in entries.values()]
+    times = np.array([float(numbers(*entry, "time", ())) for entry in zip(sources, contents, strict=True)])
     return dict(zip(entries, splits.normalised(times).tolist(), strict=True))
 
 
@@ -205,15 +211,16 @@ def _pictures(folder: Path, files: dict[str, Path], downscale: int) -> dict[str,
 
 def _frame(name: str, path: Path, content: dict[str, Any], file: Path, time: float, picture: Picture) -> Frame:
     source = f"{path}, frame '{name}'"
-    viewmat = world_to_camera(source, "transform_matrix", numbers(path, content, "transform_matrix", (4, 4)))
+    viewmat = world_to_camera(source, "transform_matrix", numbers(source, content, "transform_matrix", (4, 4)))
     if "w" in content and "h" in content:
-        size = int(numbers(path, content, "w", ())), int(numbers(path, content, "h", ()))
+        size = int(numbers(source, content, "w", ())), int(numbers(source, content, "h", ()))
     else:
         size = read_header(file).size
     if min(size) < 1:
         raise UserError(f"{source}: 'w' and 'h' are {size}; expected positive numbers of pixels")
     K, lens = _intrinsics(path, source, content, size)
-    return Frame(name, source, viewmat, K, lens, size, time, picture, alpha="coverage")
+    mask = Picture(_picture(path, value(source, content, "mask_path", str)), 1) if content.get("mask_path") else None
+    return Frame(name, source, viewmat, K, lens, size, time, picture, alpha="coverage", mask=mask)
 
 
 def _intrinsics(

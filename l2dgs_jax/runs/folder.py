@@ -114,6 +114,8 @@ def open_run(folder: str | Path, stage: Literal["final", "coarse"] = "final") ->
     path = folder / {"final": CHECKPOINT, "coarse": COARSE}[stage]
     if not checkpoints.kept(path):
         raise UserError(f"{path}: no such checkpoint; expected a run that has got that far")
+    if scene != "demo" and not Path(scene).exists():
+        raise UserError(f"{folder / SETTINGS}: names the scene {scene}, which is not there; expected its new place")
     dataset = load_dataset(scene, config.downscale, config.format, config.held_out, config.frame_memory)
     state = checkpoints.load_last(path, config, len(dataset.train.names)).state
     return Run(config, dataset, state, folder)

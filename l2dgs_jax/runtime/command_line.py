@@ -5,7 +5,6 @@ import signal
 import sys
 import warnings
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any, TypeVar
 
 import jax
@@ -72,8 +71,9 @@ def parse(kind: Callable[..., T], arguments: Sequence[str], program: str, defaul
 
 def use_compilation_cache() -> None:
     """Keep compiled programs in the user's cache folder; L2DGS_JAX_CACHE names another folder, or is "off"."""
-    base = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
-    folder = os.environ.get("L2DGS_JAX_CACHE", str(base / "l2dgs_jax"))
+    base = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    without_home = base.startswith("~")  # as in containers whose user has none
+    folder = os.environ.get("L2DGS_JAX_CACHE", "off" if without_home else os.path.join(base, "l2dgs_jax"))
     if folder != "off":
         jax.config.update("jax_compilation_cache_dir", folder)
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)

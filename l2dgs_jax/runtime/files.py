@@ -36,6 +36,17 @@ def replacing(path: Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
+def expect_room(path: Path, size: int) -> None:
+    """Check that a new file of that many bytes would fit onto the disk; leaves it there, to be written over.
+
+    Raises:
+        OSError: it does not fit.
+    """
+    with open(path, "wb") as file:
+        if hasattr(os, "posix_fallocate"):
+            os.posix_fallocate(file.fileno(), 0, size)
+
+
 def append_line(path: Path, line: str) -> None:
     """Add a line to a file. After a crash its last line may be incomplete, which readers must tolerate.
 

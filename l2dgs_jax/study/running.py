@@ -18,7 +18,7 @@ from l2dgs_jax.runtime import devices, distributed
 from l2dgs_jax.runtime.files import is_taken, make_folder, write_json
 from l2dgs_jax.study import report
 from l2dgs_jax.study.grouping import Trial, load_groups
-from l2dgs_jax.study.spec import Plan, Spec
+from l2dgs_jax.study.spec import Spec
 from l2dgs_jax.training import DivergedError, Member, Progress, engine
 from l2dgs_jax.visualize import contact_sheet
 
@@ -42,10 +42,14 @@ def run_study(spec: Spec, output: Path, *, resume: bool = False, device_count: i
         UserError: a scene cannot be read, the folder holds another study or cannot be written, or there are too few
             devices or members.
     """
-    _claim(output, spec.plans, resume)
+    described = [{"name": p.name, "scene": p.scene, "settings": to_dict(p.config)} for p in spec.plans]
+    _check_folder(output, described, resume)
     groups = load_groups(spec)
     meshes = [_mesh(group, device_count or jax.device_count()) for group in groups]
     distributed.barrier("all scenes are read")
+    if jax.process_index() == 0 and not resume:  # only now, as a study that cannot start should leave no folder
+        make_folder(output)
+        write_json(output / PLANS_FILE, described)
     for index, (group, mesh) in enumerate(zip(groups, meshes, strict=True)):
         if jax.process_index() == 0:
             size, count = f"{group[0].dataset.width}x{group[0].dataset.height}", mesh.size if mesh else 1
@@ -60,23 +64,17 @@ def run_study(spec: Spec, output: Path, *, resume: bool = False, device_count: i
     return report.write(output, [plan.name for plan in spec.plans])
 
 
-def _claim(output: Path, plans: Sequence[Plan], resume: bool) -> None:
-    """Record the study's members in its folder, or check that they are those recorded."""
-    described = [{"name": p.name, "scene": p.scene, "settings": to_dict(p.config)} for p in plans]
-    path = output / PLANS_FILE
+def _check_folder(output: Path, described: list[dict], resume: bool) -> None:
+    """Check that the folder is free, or that it holds the study of these members."""
     if resume:
         try:
-            held = json.loads(path.read_text())
+            held = json.loads((output / PLANS_FILE).read_text())
         except (OSError, ValueError):
             raise UserError(f"{output}: holds no study to resume; expected a folder that sweep wrote") from None
         if held != described:
             raise UserError(f"{output}: holds a study of other members or settings; expected the same file again")
     elif is_taken(output):
         raise UserError(f"{output}: already holds a study or files; expected a new folder, or --resume")
-    distributed.barrier("the folder is looked at")
-    if jax.process_index() == 0 and not resume:
-        make_folder(output)
-        write_json(path, described)
 
 
 def _mesh(group: Sequence[Trial], device_count: int) -> Mesh | None:

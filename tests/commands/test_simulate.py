@@ -159,6 +159,7 @@ def test_a_brightening_network_changes_nothing_unless_allowed(scene, tmp_path):
         (["--photons", "inf"], ["--photons"]),
         (["--seed", "-1"], ["--seed -1"]),
         (["--photons", "9", "--read-noise", "-1"], ["--read-noise"]),
+        (["--read-noise", "5"], ["--read-noise", "--photons"]),
         (["--weights", "some.npz"], ["--weights", "--method"]),
         (["--method", "network", "--weights", "nonsuch.pth"], ["nonsuch.pth"]),
         (["--downscale", "0"], ["--downscale"]),

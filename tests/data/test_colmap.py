@@ -4,12 +4,13 @@ import shutil
 import struct
 
 import numpy as np
+import OpenImageIO as oiio  # noqa: N813
 import pytest
 from scenes import write_image, write_nerfies
 from scipy.spatial.transform import Rotation
 
 from l2dgs_jax import data
-from l2dgs_jax.data import colmap, colmap_model
+from l2dgs_jax.data import colmap, colmap_model, images
 from l2dgs_jax.data.lens import distort
 from l2dgs_jax.errors import UserError
 
@@ -113,6 +114,42 @@ def test_pictures_are_found_where_users_keep_them(scene, place):
     for path in (scene / place).glob("*.png"):
         write_image(scene.parent / "scene_2" / path.name, np.ones((12, 16, 3)))  # another scene
     assert data.load_dataset(scene, 2).train.images.max() < 0.5
+
+
+def test_other_folders_than_images_do_not_stand_in_for_it(scene):
+    shutil.copytree(scene / "images", scene / "masks")
+    (scene / "images" / "000000.png").unlink()
+    with pytest.raises(UserError, match=r"images: holds 9 pictures, but none for 1 of the \d frames, such as '000000'"):
+        data.load_dataset(scene)
+    shutil.rmtree(scene / "images")
+    (scene / "masks" / "000000.png").unlink()
+    with pytest.raises(UserError, match=r"images: no such folder"):
+        data.load_dataset(scene)
+
+
+def test_folders_that_could_both_be_meant_are_named(scene):
+    shutil.move(scene / "images", scene / "frames")
+    shutil.copytree(scene / "frames", scene / "masks")
+    with pytest.raises(UserError, match=r"scene: frames/ and masks/ both hold a picture for every image"):
+        data.load_dataset(scene)
+
+
+@pytest.mark.parametrize("orientation", [3, 6])
+def test_pictures_are_as_stored_because_colmap_ignores_their_orientation(scene, orientation):
+    expected = data.load_dataset(scene).train.images
+    for path in (scene / "images").iterdir():
+        pixels = oiio.ImageBuf(str(path))
+        pixels.specmod().attribute("Orientation", orientation)
+        assert pixels.write(str(path))
+    assert images.read_header(path).orientation == orientation
+    assert np.array_equal(data.load_dataset(scene).train.images, expected)
+
+
+def test_hidden_files_are_no_pictures(scene):
+    expected = data.load_dataset(scene).train.images
+    (scene / "images" / "._000000.png").write_bytes(b"made by another program")
+    write_image(scene / "images" / ".thumbs" / "000000.png", np.ones((3, 4, 3)))
+    assert np.array_equal(data.load_dataset(scene).train.images, expected)
 
 
 def test_smaller_copies_of_the_pictures_are_used(scene):

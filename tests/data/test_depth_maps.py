@@ -3,7 +3,7 @@ import shutil
 import cv2
 import numpy as np
 import pytest
-from scenes import write_nerfies
+from scenes import write_image, write_nerfies
 from scipy.spatial import cKDTree
 
 from l2dgs_jax import data
@@ -190,3 +190,10 @@ def test_depth_stays_with_its_frame_whichever_are_held_out(scene):
     dataset = data.load_dataset(write_depth(scene, names), held_out="2")
     for split in (dataset.train, dataset.test):
         assert [depth.any() for depth in split.depths] == [name in names for name in split.names]
+
+
+def test_coloured_pictures_are_no_depth(scene):
+    for name in train_names(scene):
+        write_image(scene / "disparity" / "1x" / f"{name}.png", np.random.default_rng(0).random((HEIGHT, WIDTH, 3)))
+    with pytest.raises(UserError, match=r"is a coloured picture of depth; expected grey values"):
+        data.load_dataset(scene)

@@ -1,5 +1,7 @@
 """Picture files of every kind are read as sRGB values in [0, 1]."""
 
+import resource
+
 import cv2
 import numpy as np
 import OpenImageIO as oiio  # noqa: N813
@@ -8,7 +10,7 @@ from scenes import write_image, write_nerfies
 
 from l2dgs_jax import data
 from l2dgs_jax.data import assembly, images, lens
-from l2dgs_jax.errors import UserError
+from l2dgs_jax.errors import DISK_FULL, UserError
 
 
 def write(path, pixels, orientation=1, **attributes):
@@ -31,7 +33,7 @@ def test_integer_formats_are_read(tmp_path, suffix):
     write(tmp_path / f"a{suffix}", np.ascontiguousarray(pixels))
     exact = suffix in (".png", ".tif", ".bmp")
     np.testing.assert_allclose(images.read_image(tmp_path / f"a{suffix}"), pixels / 255, atol=1e-6 if exact else 0.05)
-    assert images.read_header(tmp_path / f"a{suffix}") == ((24, 24), False, False)
+    assert images.read_header(tmp_path / f"a{suffix}") == ((24, 24), 1, False)
 
 
 @pytest.mark.parametrize(("suffix", "kind"), [(".exr", np.float32), (".exr", np.float16), (".hdr", np.float32)])
@@ -75,7 +77,7 @@ def test_photos_are_turned_upright(tmp_path, orientation):
     stored = np.rot90(flipped, turns[orientation])
     write(tmp_path / "a.tif", np.ascontiguousarray(stored), orientation)
     np.testing.assert_allclose(images.read_image(tmp_path / "a.tif"), upright / 255, atol=1e-6)
-    assert images.read_header(tmp_path / "a.tif") == ((6, 4), orientation >= 5, False)
+    assert images.read_header(tmp_path / "a.tif") == ((6, 4), orientation, False)
     viewer = oiio.ImageBuf(str(tmp_path / "a.tif"))
     np.testing.assert_array_equal(oiio.ImageBufAlgo.reorient(viewer).get_pixels(oiio.UINT8), upright)
 
@@ -165,4 +167,26 @@ def test_images_of_any_bit_depth_and_channels_are_written_and_read(tmp_path, dty
     write_image(tmp_path / "a.png", pixels)
     expected = np.repeat(pixels[..., None], 3, -1) if channels is None else pixels[..., :3]
     np.testing.assert_allclose(images.read_image(tmp_path / "a.png"), expected / np.iinfo(dtype).max, atol=1e-6)
-    assert images.read_header(tmp_path / "a.png") == ((6, 5), False, False)
+    assert images.read_header(tmp_path / "a.png") == ((6, 5), 1, False)
+
+
+def test_values_beyond_the_range_are_clipped(tmp_path):
+    write(tmp_path / "a.exr", np.array([[[-0.1, 0.5, 1.5]]], np.float32), **{"oiio:ColorSpace": "sRGB"})
+    np.testing.assert_allclose(images.read_image(tmp_path / "a.exr"), [[[0, 0.5, 1]]], atol=1e-3)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".exr", ".webp"])
+def test_a_full_disk_is_reported_and_leaves_the_old_picture(tmp_path, suffix):
+    path = tmp_path / f"a{suffix}"
+    images.write_image(path, np.zeros((8, 8, 3), np.float32 if suffix == ".exr" else np.uint8))
+    old, large = path.read_bytes(), np.zeros((256, 256, 3), np.float32 if suffix == ".exr" else np.uint8)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (2**16, limits[1]))  # as if no more bytes were free
+    try:
+        with pytest.raises(UserError, match=rf"a\{suffix}: ") as error:
+            images.write_image(path, large)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert error.value.code == DISK_FULL
+    assert path.read_bytes() == old
+    assert [*tmp_path.iterdir()] == [path]

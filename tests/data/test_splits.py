@@ -41,6 +41,8 @@ def test_unknown_rules_are_refused(rule):
         (["f_001", "f_002", "f_005"], [0, 0.25, 1]),  # by number, as frames may be missing
         (["left_1", "left_3", "right_1", "right_3"], [0, 1, 0, 1]),  # two cameras at the same instants
         (["a9_10.5", "a9_10.7"], [0, 1]),
+        (["0000_0", "0000_1", "0001_0", "0001_1", "0004_0"], [0, 0, 0.25, 0.25, 1]),  # numbers of cameras at the end
+        (["0_cam0", "3_cam0", "6_cam1"], [0, 0.5, 1]),
         (["take7", "take7b", "take7c"], [0, 0.5, 1]),  # all have the same number: by order
         (["1", "2", "x"], [0, 0.5, 1]),  # not all have a number: by order
         (["only"], [0]),
@@ -62,3 +64,15 @@ def test_instants_from_metadata(tmp_path):
     assert instants({}, {}, {}) == [0, 0.5, 1]
     write_json(tmp_path / "metadata.json", {"somebody": "else's"})
     assert list(splits.instants(tmp_path, ["a", "b"]).values()) == [0, 1]
+
+
+def test_frames_that_are_listed_twice_are_only_held_out():
+    names = [f"{i}" for i in range(6)]
+    train, test, notes = splits.hold_out("lists", names, (["0", "1", "2", "2", "3"], ["3", "5", "5"]), "auto", "8")
+    assert (train, test) == (["0", "1", "2"], ["3", "5"])
+    assert notes == ("lists: 2 frames are listed twice; what is held out is not trained on",)
+
+
+def test_all_but_the_frames_held_out_are_trained_on(tmp_path):
+    write_json(tmp_path / "dataset.json", {"val_ids": ["b"]})
+    assert splits.lists_beside(tmp_path, ["a", "b", "c"]) == (["a", "c"], ["b"])

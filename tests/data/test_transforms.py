@@ -280,3 +280,32 @@ def test_ply_clouds_of_any_format_are_read(tmp_path, form):
     read, colors = clouds.read_ply(tmp_path / "cloud.ply")
     np.testing.assert_array_equal(read, points)
     np.testing.assert_allclose(colors, paint / 255, rtol=1e-6)
+
+
+def test_masks_that_are_named_say_which_pixels_count(studio):
+    mask = np.ones((24, 32))
+    mask[:10] = 0
+    write_image(studio / "masks" / "m.png", mask)
+    assert data.load_dataset(studio).train.valid is None
+    edit_frames(studio, mask_path="masks/m.png")
+    dataset = data.load_dataset(studio, 2)
+    assert np.all(dataset.train.valid == (np.arange(12) >= 5)[:, None])
+    edit_frames(studio, mask_path="masks/nonsuch.png")
+    with pytest.raises(UserError, match=r"nonsuch\.png: no such file"):
+        data.load_dataset(studio)
+
+
+def test_depth_that_is_not_read_is_mentioned(studio):
+    edit_frames(studio, depth_file_path="depths/1.png")
+    assert any("'depth_file_path' is not read" in note for note in data.load_dataset(studio).notes)
+
+
+def test_truth_is_composited_over_black_like_its_input(studio):
+    covered = np.dstack([np.full((24, 32, 3), 0.8), np.tile(np.arange(32) < 16, (24, 1))])
+    dataset = data.load_dataset(studio)
+    for name in (*dataset.train.names, *dataset.test.names):
+        write_image(studio / "images" / f"{name}.png", covered)
+        write_image(studio / "well" / "1x" / f"{name}.png", covered)
+    dataset = data.load_dataset(studio)
+    np.testing.assert_array_equal(dataset.train.welllit, dataset.train.images)
+    assert dataset.train.welllit[..., 16:, :].max() == 0

@@ -106,3 +106,14 @@ def test_masks_of_some_frames_only_are_mentioned(tmp_path):
     assert dataset.train.masks is None
     assert dataset.test.masks is not None
     assert dataset.notes == ("mask/1x/ has pictures of 5 of 6 frames, but not of '000003': not used",)
+
+
+@pytest.mark.parametrize("kind", ["well", "mask"])
+def test_pictures_that_are_called_otherwise_than_the_frames_are_mentioned(tmp_path, kind):
+    scene = write_nerfies(tmp_path, truth=True)
+    for path in sorted((scene / kind / "1x").iterdir()):
+        path.rename(path.with_name(f"{kind}_{path.name}"))
+    dataset = data.load_dataset(scene)
+    assert (dataset.train.welllit if kind == "well" else dataset.train.masks) is None
+    example = f"{kind}/1x/000000.png"
+    assert dataset.notes == (f"{kind}/ has no picture that is called like a frame, such as {example}: not used",)

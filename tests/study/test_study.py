@@ -247,3 +247,10 @@ def test_the_table_shows_what_was_varied_and_scored(tmp_path):
         "| b | 0 |  | diverged at step 3 | 7 | inf | 1.000 |",
     ]
     assert (tmp_path / report.PLOTS).stat().st_size > 1000
+
+
+def test_a_study_that_cannot_start_leaves_no_folder(study, tmp_path):
+    spec = read(study('scenes = ["nonsuch"]\n[settings]\ncoarse_steps = 2\nfine_steps = 0'))
+    with pytest.raises(UserError, match="nonsuch"):
+        running.run_study(spec, tmp_path / "out")
+    assert not (tmp_path / "out").exists()

@@ -2,7 +2,6 @@
 
 import contextlib
 import math
-import re
 import shutil
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -14,6 +13,7 @@ from jaxtyping import Float32, Shaped, UInt8
 from tqdm import tqdm
 
 from l2dgs_jax.data import images
+from l2dgs_jax.data.splits import numbers_in
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.runtime.files import replacing
 
@@ -123,7 +123,8 @@ def shrink(grey: Shaped[np.ndarray, "H W"], longest: int) -> Shaped[np.ndarray, 
 
 
 def _scan_folder(folder: Path) -> list[Candidate]:
-    paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in images.SUFFIXES and path.is_file())
+    pictures = (path for path in folder.iterdir() if path.suffix.lower() in images.SUFFIXES and path.is_file())
+    paths = sorted(path for path in pictures if not path.name.startswith("."))
     if not paths:
         raise UserError(f"{folder}: holds no pictures; expected frames ({', '.join(images.SUFFIXES)})")
     numbered = sorted(zip(_numbers([path.stem for path in paths]), paths, strict=True))
@@ -141,16 +142,13 @@ def _scan_folder(folder: Path) -> list[Candidate]:
 
 
 def _numbers(stems: Sequence[str]) -> list[int]:
-    """The last number in each name that differs between all names, or else the names' places in alphabetical order."""
-    groups = [[int(digits) for digits in re.findall(r"[0-9]+", stem)][::-1] for stem in stems]
-    for numbers in zip(*groups, strict=False):
-        if len(set(numbers)) == len(stems):
-            return list(numbers)
-    return list(range(len(stems)))
+    """The numbers in the names, if they differ between all of these, or else their places in alphabetical order."""
+    numbers = numbers_in(stems)
+    return numbers if len(set(numbers)) == len(stems) else list(range(len(stems)))
 
 
 def _take(path: Path, target: Path) -> None:
-    if path.suffix.lower() == ".png":
+    if path.suffix.lower() == ".png" and images.read_header(path).orientation == 1:
         with replacing(target) as temporary:
             shutil.copyfile(path, temporary)
         return

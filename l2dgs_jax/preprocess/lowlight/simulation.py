@@ -24,6 +24,7 @@ from l2dgs_jax.visualize.sheet import sheet
 Bytes = UInt8[np.ndarray, "H W 3"]
 
 
+READ_NOISE = 2.0  # electrons, unless something else is asked for
 MAX_ELECTRONS = 1e9
 DRIFT_PERIODS = 1.5  # of the wave by which exposure drifts, over the whole video
 SAMPLED_PIXELS = 1_000_000  # of a video, that its darkening is fitted to
@@ -45,7 +46,7 @@ class DarkeningConfig:
             to its mean; 0 for constant exposure.
         photons: electrons per pixel that white stands for; if given, sensor noise is added, which is stronger for fewer
             electrons.
-        read_noise: standard deviation of the sensor's read noise, in electrons.
+        read_noise: standard deviation of the sensor's read noise, in electrons; 2 with `photons` if not given.
         lab_order: how lightness is computed: "correct", or "lednet", with red and blue swapped as in LEDNet's script.
         allow_brightening: let pixels become brighter where the network says so, as LEDNet does.
         seed: seed of exposures and noise.
@@ -58,7 +59,7 @@ class DarkeningConfig:
     per_image: bool = False
     exposure_drift: float = 0.0
     photons: float | None = None
-    read_noise: float = 2.0
+    read_noise: float | None = None
     lab_order: darkening.LabOrder = "correct"
     allow_brightening: bool = False
     seed: int = 0
@@ -79,8 +80,10 @@ class DarkeningConfig:
             raise UserError(f"--exposure-drift {self.exposure_drift:g}: expected a share from 0, below 1")
         if self.weights is not None and self.method != "network":
             raise UserError("--weights: go with --method network; expected that method, or no weights")
+        if self.read_noise is not None and self.photons is None:
+            raise UserError("--read-noise: goes with --photons; expected both, or neither")
         if self.photons is not None and not (
-            0 < self.photons <= MAX_ELECTRONS and 0 <= self.read_noise <= MAX_ELECTRONS
+            0 < self.photons <= MAX_ELECTRONS and 0 <= (self.read_noise or 0) <= MAX_ELECTRONS
         ):
             raise UserError(
                 "--photons and --read-noise: expected electrons, the former more than 0, the latter at least 0, "
@@ -126,7 +129,8 @@ def darken(dataset: Dataset, cfg: DarkeningConfig) -> tuple[Dataset, dict[str, F
         image = _floats(pictures[i])
         low = darkening.scale_light(darkened(i), lights[i])
         if cfg.photons is not None:
-            low = darkening.add_sensor_noise(low, (cfg.seed, i), cfg.photons, cfg.read_noise)
+            read_noise = READ_NOISE if cfg.read_noise is None else cfg.read_noise
+            low = darkening.add_sensor_noise(low, (cfg.seed, i), cfg.photons, read_noise)
         dark.append(darkening.truncate(low))
         low = _floats(dark[i])
         psnr = float(metrics.psnr(jnp.asarray(low), jnp.asarray(image)))
