@@ -23,6 +23,7 @@ from l2dgs_jax.data import load_dataset
 from l2dgs_jax.model import channels, hexplane, networks
 from l2dgs_jax.model.decomposition import decompose
 from l2dgs_jax.model.deformation import deform
+from l2dgs_jax.model.initialisation import path_knots
 from l2dgs_jax.model.rendering import Renderer
 from l2dgs_jax.rasterizer import count_pairs, rasterize
 from l2dgs_jax.runtime import devices
@@ -184,10 +185,10 @@ def rendering() -> Figures:
 def seeding() -> Figures:
     """Work before the first step, on the demo clip: flow between frames, seeds on moving objects, static points."""
     dataset = load_dataset("demo")
-    most = dataset.width * dataset.height
+    most, knots = dataset.width * dataset.height, path_knots(PRESETS["demo"].model, len(dataset.train.names))
     return {
         "demo_flow_ms": best_of(lambda: neighbour_flows(dataset.train, filled=True), 3),
-        "demo_flow_and_seeds_ms": best_of(lambda: find_seeds(dataset.points, dataset.train, most), 3),
+        "demo_flow_and_seeds_ms": best_of(lambda: find_seeds(dataset.points, dataset.train, knots, most), 3),
         "demo_surfaces_ms": best_of(lambda: find_surfaces(dataset.points, dataset.train, most), 3),
     }
 

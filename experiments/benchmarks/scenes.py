@@ -90,7 +90,7 @@ def fine_state(dataset: Dataset, config: Config, moving_share: float = 1.0) -> T
     if config.model.tracks:
         lifetimes = np.where(drawn[:, None] < PATH_SHARE, [0.0, 1.0], [-np.inf, np.inf])
         gaussians = gaussians._replace(lifetimes=jnp.asarray(lifetimes, float))
-        paths = jnp.zeros((next_capacity(PATH_SHARE * count), path_knots(frames), 3))
+        paths = jnp.zeros((next_capacity(PATH_SHARE * count), path_knots(config.model, frames), 3))
         path_of = jnp.arange(len(drawn), dtype=jnp.int32) % len(paths)
     if gaussians.gate is not None:
         gaussians = gaussians._replace(gate=jnp.where(drawn >= moving_share, -np.inf, gaussians.gate))

@@ -17,10 +17,11 @@ from jaxtyping import Float, Float32
 from l2dgs_jax.cameras.epipolar import epipolar_geometry, project
 from l2dgs_jax.cameras.flow import pixel_indices
 from l2dgs_jax.cameras.geometry import points_inside
+from l2dgs_jax.config import PRESETS
 from l2dgs_jax.data import Split, load_dataset
 from l2dgs_jax.data.dataset import Dataset
 from l2dgs_jax.model.deformation import path_weights
-from l2dgs_jax.model.initialisation import Seeds
+from l2dgs_jax.model.initialisation import Seeds, path_knots
 from l2dgs_jax.training.seeds import find_seeds
 from l2dgs_jax.types import Camera
 
@@ -40,7 +41,8 @@ def main() -> None:
     options = parser.parse_args()
     for scene in options.scenes:
         seen, full = load_dataset(scene, options.downscale), load_dataset(scene)
-        seeds = find_seeds(seen.points, seen.train, most=seen.train.images[0, ..., 0].size)
+        knots = path_knots(PRESETS["default"].model, len(seen.train.names))
+        seeds = find_seeds(seen.points, seen.train, knots, most=seen.train.images[0, ..., 0].size)
         found = errors(seeds, seen.train, stereo(full))
         together = np.concatenate(found)
         print(f"{scene.name}: {summary(together)}; by parts: {', '.join(map(summary, _parts(found)))}")

@@ -92,7 +92,7 @@ class ModelConfig:
     # share of the HexPlane's cells for the (contracted) space outside its box; 0: points outside take the feature of
     # the nearest point of the box
     box_rim: float = 0.0
-    time_size: int | None = None  # HexPlane cells along the time axis; None: half the number of training frames
+    time_size: int | None = None  # HexPlane cells along the time axis; None: half the number of instants
     # part of the time axis that is used: "upper" is its upper half, as in the authors' code, where planes are read at t
     # in [0, 1] as if it lay in [-1, 1]
     time_range: Literal["full", "upper"] = "full"

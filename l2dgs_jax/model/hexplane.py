@@ -13,6 +13,11 @@ from l2dgs_jax.kernels.hexplane_lookup import Layout, lerp, lookup
 from l2dgs_jax.types import HexPlane
 
 
+def time_cells(cfg: ModelConfig, num_frames: int) -> int:
+    """Cells along the axis of time: `cfg.time_size`, or else half of the number of training frames, at least 2."""
+    return max(num_frames // 2, 2) if cfg.time_size is None else cfg.time_size
+
+
 def init(key: PRNGKeyArray, cfg: ModelConfig, num_frames: int) -> HexPlane:
     """Planes as 4DGS (arXiv 2310.08528) starts them: U(0.1, 0.5) in space, 1 in time.
 
@@ -20,14 +25,14 @@ def init(key: PRNGKeyArray, cfg: ModelConfig, num_frames: int) -> HexPlane:
 
     Args:
         key: randomness of the space planes.
-        cfg: sizes. `cfg.time_size` None means half of `num_frames`, at least 2.
+        cfg: sizes.
         num_frames: training frames.
 
     Raises:
         ValueError: an axis has fewer than two cells.
     """
     sizes = [scale * cfg.plane_size for scale in cfg.plane_scales]
-    time_size = max(num_frames // 2, 2) if cfg.time_size is None else cfg.time_size
+    time_size = time_cells(cfg, num_frames)
     if min(*sizes, time_size) < 2:
         raise ValueError(f"HexPlane needs at least 2 cells an axis, not {sizes} in space and {time_size} in time")
     keys = jax.random.split(key, len(sizes))

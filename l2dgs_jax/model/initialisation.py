@@ -46,9 +46,9 @@ class Seeds(NamedTuple):
     lifetimes: Float[np.ndarray, "S 2"]
 
 
-def path_knots(num_frames: int) -> int:
-    """How many control points a path has: half as many as there are training frames, but 4 to `MAX_KNOTS`."""
-    return min(max(num_frames // 2, 4), MAX_KNOTS)
+def path_knots(cfg: ModelConfig, num_frames: int) -> int:
+    """How many control points a path has: as many as the motion field has cells in time, but 4 to `MAX_KNOTS`."""
+    return min(max(hexplane.time_cells(cfg, num_frames), 4), MAX_KNOTS)
 
 
 def z_order(points: np.ndarray) -> np.ndarray:
@@ -145,7 +145,7 @@ def scene_shapes(cfg: ModelConfig, num_frames: int) -> Scene:
     """
     shapes: tuple = ((1, 3), (2, 3), (1,), (1,), (1,), (1, 3), (2,), (), (num_frames, 3), (RAMPS,))
     if cfg.tracks:
-        shapes += ((1, path_knots(num_frames), 3), (1, 2))
+        shapes += ((1, path_knots(cfg, num_frames), 3), (1, 2))
     rows = [jax.ShapeDtypeStruct(shape, jnp.zeros(()).dtype) for shape in shapes]
     build = partial(_initialise, cfg=_static_settings(cfg), num_frames=num_frames, capacity=1)
     return jax.eval_shape(build, jax.eval_shape(lambda: jax.random.key(0)), *rows)

@@ -1,5 +1,6 @@
 """Training, scoring and tabulating all members of a study."""
 
+import contextlib
 import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -13,9 +14,13 @@ from l2dgs_jax.config import to_dict
 from l2dgs_jax.data.images import write_image
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.runs import Recorder, Run
+from l2dgs_jax.runs.advice import misfit
+from l2dgs_jax.runs.persistence import LESS_MEMORY
 from l2dgs_jax.runs.scores import evaluate
 from l2dgs_jax.runtime import devices, distributed
 from l2dgs_jax.runtime.files import is_taken, make_folder, write_json
+from l2dgs_jax.runtime.locks import locked
+from l2dgs_jax.runtime.memory import memory_errors
 from l2dgs_jax.study import report
 from l2dgs_jax.study.grouping import Trial, load_groups
 from l2dgs_jax.study.spec import Spec
@@ -40,28 +45,44 @@ def run_study(spec: Spec, output: Path, *, resume: bool = False, device_count: i
 
     Raises:
         UserError: a scene cannot be read, the folder holds another study or cannot be written, or there are too few
-            devices or members.
+            devices or members; or another process works in the folder, or memory does not suffice.
     """
     described = [{"name": p.name, "scene": p.scene, "settings": to_dict(p.config)} for p in spec.plans]
     _check_folder(output, described, resume)
-    groups = load_groups(spec)
-    meshes = [_mesh(group, device_count or jax.device_count()) for group in groups]
-    distributed.barrier("all scenes are read")
-    if jax.process_index() == 0 and not resume:  # only now, as a study that cannot start should leave no folder
-        make_folder(output)
-        write_json(output / PLANS_FILE, described)
-    for index, (group, mesh) in enumerate(zip(groups, meshes, strict=True)):
-        if jax.process_index() == 0:
-            size, count = f"{group[0].dataset.width}x{group[0].dataset.height}", mesh.size if mesh else 1
-            print(f"group {index + 1} of {len(groups)}: {len(group)} members at {size}, devices: {count}")
-        _train(group, output, mesh)
-        distributed.barrier("the group is trained")
-        for trial in group[jax.process_index() :: jax.process_count()]:
-            _score(trial, output)
-    distributed.barrier("all members are scored")
-    if jax.process_index() > 0:
-        return []
-    return report.write(output, [plan.name for plan in spec.plans])
+    first, reached = jax.process_index() == 0, "before the first step"
+    with contextlib.ExitStack() as stack, memory_errors(lambda: reached, LESS_MEMORY):
+        if first and resume:
+            stack.enter_context(locked(output))
+        groups = load_groups(spec)
+        meshes = [_mesh(group, device_count or jax.device_count()) for group in groups]
+        distributed.barrier("all scenes are read")
+        if first and not resume:  # only now, as a study that cannot start should leave no folder
+            make_folder(output)
+            write_json(output / PLANS_FILE, described)
+            stack.enter_context(locked(output))
+        if first:
+            _print_notes(groups)
+        for index, (group, mesh) in enumerate(zip(groups, meshes, strict=True)):
+            reached = f"in group {index + 1} of {len(groups)}"
+            if first:
+                size, count = f"{group[0].dataset.width}x{group[0].dataset.height}", mesh.size if mesh else 1
+                print(f"group {index + 1} of {len(groups)}: {len(group)} members at {size}, devices: {count}")
+            _train(group, output, mesh)
+            distributed.barrier("the group is trained")
+            for trial in group[jax.process_index() :: jax.process_count()]:
+                _score(trial, output)
+        distributed.barrier("all members are scored")
+        return report.write(output, [plan.name for plan in spec.plans]) if first else []
+
+
+def _print_notes(groups: Sequence[Sequence[Trial]]) -> None:
+    """What readers assumed about the scenes, and where these do not fit the settings, each once."""
+    trials = [trial for group in groups for trial in group]
+    notes = [f"note: {note}" for trial in trials for note in trial.dataset.notes]
+    warnings = [(trial, misfit(trial.dataset, trial.config)) for trial in trials]
+    notes += [f"warning: {trial.dataset.name}: {warning}" for trial, warning in warnings if warning]
+    for note in dict.fromkeys(notes):
+        print(note)
 
 
 def _check_folder(output: Path, described: list[dict], resume: bool) -> None:

@@ -11,7 +11,7 @@ from l2dgs_jax.config import Config, overrides
 from l2dgs_jax.data.dataset import Dataset, Split
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.model import networks
-from l2dgs_jax.model.initialisation import initialise, scene_shapes, z_order
+from l2dgs_jax.model.initialisation import initialise, path_knots, scene_shapes, z_order
 from l2dgs_jax.model.observation import exposures, observed_colors
 from l2dgs_jax.model.tone import Darkening, darkening, lit_level, recognise
 from l2dgs_jax.model.tone_curves import equalising_law, power_law
@@ -59,6 +59,9 @@ def resolve(config: Config, dataset: Dataset) -> Config:
         raise UserError(
             f"{dataset.name}: {error}; expected poses that face its points: they may be in another axis convention"
         ) from None
+    instants = len(np.unique(split.cameras.time))
+    if config.model.time_size is None and instants < len(split.names):  # several cameras
+        config = overrides.replace(config, {"model.time_size": max(instants // 2, 2)})
     if config.density.max_gaussians == "auto":
         config = overrides.replace(config, {"density.max_gaussians": _max_gaussians(split)})
     if config.model.exposure == "auto":
@@ -94,10 +97,11 @@ def _max_gaussians(split: Split) -> int:
 
 def initial_state(dataset: Dataset, config: Config) -> TrainState:
     """The state before the first step of a `resolve`d config; the same seed and data give the same state."""
-    train, points, colors = dataset.train, dataset.points, dataset.colors
+    train, points = dataset.train, dataset.points
+    colors = dataset.colors if config.model.initial_illumination is None else None  # what they are needed for
     if config.model.surfaces:
         found = find_surfaces(points, train, most=max(int(config.density.max_gaussians) - len(points), 0))
-        if colors is not None and config.model.initial_illumination is None:
+        if colors is not None:
             colors = np.concatenate([colors, observed_colors(found, train.cameras, train.images, train.valid)])
         points = np.concatenate([points, found])
     order = z_order(points)
@@ -105,7 +109,8 @@ def initial_state(dataset: Dataset, config: Config) -> TrainState:
     seeds = None
     if config.model.tracks:
         # Not the added points: the nearest ones of so many are too near to give the depth of what moves.
-        seeds = find_seeds(dataset.points, train, most=min(_max_gaussians(train), int(config.density.max_gaussians)))
+        most = min(_max_gaussians(train), int(config.density.max_gaussians))
+        seeds = find_seeds(dataset.points, train, path_knots(config.model, len(train.names)), most)
     capacity = len(points) + (0 if seeds is None else len(seeds.points))
     if config.density.start < config.density.stop:
         limit = max(int(config.density.max_gaussians), capacity)

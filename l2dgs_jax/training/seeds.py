@@ -12,7 +12,7 @@ from l2dgs_jax.cameras.geometry import camera_centres, pixel_rays
 from l2dgs_jax.cameras.ground import horizontal_per_depth
 from l2dgs_jax.data.dataset import Split
 from l2dgs_jax.model.deformation import path_weights
-from l2dgs_jax.model.initialisation import Seeds, path_knots, z_order
+from l2dgs_jax.model.initialisation import Seeds, z_order
 from l2dgs_jax.training.backdrop import (
     Backdrop,
     Cameras,
@@ -33,7 +33,7 @@ BACKGROUND_SHARE = 0.5  # share of a track's observations, from which on it is t
 STIFFNESS = 1e-3  # weight of squared second differences of a path, relative to squared distances from the track
 
 
-def find_seeds(points: Float[np.ndarray, "P 3"], split: Split, most: int) -> Seeds:
+def find_seeds(points: Float[np.ndarray, "P 3"], split: Split, knots: int, most: int) -> Seeds:
     """Seeds on what moves between the frames; none where no flow can be trusted.
 
     If the scene has depth maps, they tell how far away the seeds are, after being fitted to the points.
@@ -41,12 +41,12 @@ def find_seeds(points: Float[np.ndarray, "P 3"], split: Split, most: int) -> See
     Args:
         points: of the scene, world units.
         split: the frames.
+        knots: control points of a path.
         most: how many seeds there may be; the longest tracks come first.
     """
     height, width = split.images.shape[1:3]
     backdrop = find_backdrop(points, split.cameras, height, width)
     cameras = backdrop.cameras
-    knots = path_knots(len(cameras.time))
     weights = np.asarray(path_weights(jnp.asarray(cameras.time), knots))
     chosen = moving_tracks(split, backdrop, most)
     if not len(chosen.numbers):

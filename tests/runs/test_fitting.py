@@ -90,6 +90,15 @@ def test_automatic_max_gaussians_follows_pixels_and_views_up_to_a_bound(dataset,
     assert resolve(config, large).density.max_gaussians == found
 
 
+@pytest.mark.parametrize(("cameras", "cells"), [(1, None), (3, 2)])
+def test_the_resolution_of_time_is_that_of_instants(dataset, cameras, cells):
+    count = len(dataset.train.names)
+    rig = dataset.train.cameras._replace(time=np.floor(np.arange(count) / cameras).astype(np.float32) / count)
+    config = overrides.replace(tiny(), {"model.time_size": None})
+    dataset = dataclasses.replace(dataset, train=dataclasses.replace(dataset.train, cameras=rig))
+    assert resolve(config, dataset).model.time_size == cells
+
+
 def test_automatic_settings_are_derived_from_the_data(dataset, quick):
     automatic = {"model.initial_exponents": ("auto", 9.0), "model.initial_illumination": "auto"}
     automatic |= {"loss.exposure_level": "auto", "model.domain": "auto", "model.tone": "auto"}

@@ -254,3 +254,24 @@ def test_a_study_that_cannot_start_leaves_no_folder(study, tmp_path):
     with pytest.raises(UserError, match="nonsuch"):
         running.run_study(spec, tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+def test_a_study_mentions_what_is_odd_about_its_scenes_once_and_works_alone(study, tmp_path, monkeypatch, capsys):
+    scene = write_nerfies(tmp_path / "blobs", truth=True)
+    (scene / "mask" / "1x" / "000003.png").unlink()
+    settings = "[settings]\nmodel.tracks = false\nmodel.surfaces = false"
+    spec = read(study(f'scenes = ["{scene}"]\nseeds = [0, 1]\n{settings}'))
+
+    def train(group, output, mesh):
+        with pytest.raises(UserError, match="another process is training in it"):
+            running.run_study(spec, output, resume=True)
+        raise MemoryError
+
+    monkeypatch.setattr(running, "_train", train)
+    with pytest.raises(UserError, match="out of memory in group 1 of 1; expected enough"):
+        running.run_study(spec, tmp_path / "out")
+    printed = capsys.readouterr().out.splitlines()
+    assert [line for line in printed if line.startswith("note: ")] == [
+        "note: mask/1x/ has pictures of 5 of 6 frames, but not of '000003': not used"
+    ]
+    assert sum(line.startswith("warning: blobs: 6 frames are few") for line in printed) == 1

@@ -14,7 +14,7 @@ from clips import FOCAL, HEIGHT, WIDTH, camera, clip, render
 from tiny_training import FRAMES, assert_equal_states, finish, make_dataset, state_of, tiny
 
 from l2dgs_jax.cameras.geometry import camera_centres, pixel_rays, points_inside
-from l2dgs_jax.config import overrides
+from l2dgs_jax.config import ModelConfig, overrides
 from l2dgs_jax.data import Split
 from l2dgs_jax.model.deformation import path_weights
 from l2dgs_jax.model.initialisation import Seeds, path_knots
@@ -26,7 +26,7 @@ from l2dgs_jax.training.state import with_capacity
 from l2dgs_jax.training.step import densify
 from l2dgs_jax.types import Camera
 
-COUNT, MANY = 14, 10_000
+COUNT, KNOTS, MANY = 14, 7, 10_000
 SQUARE = -0.5  # where on the z axis the moving square is
 K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]], np.float32)
 
@@ -55,7 +55,7 @@ def filmed(block):
 
 @functools.cache
 def found():
-    return find_seeds(surfaces(), filmed(block=True)[0], MANY)
+    return find_seeds(surfaces(), filmed(block=True)[0], KNOTS, MANY)
 
 
 def projected(seeds, split, frame):
@@ -92,7 +92,7 @@ def test_seeds_follow_and_cover_the_moving_square(frame):
 def test_what_moves_by_half_its_size_or_more_from_frame_to_frame_is_covered(every):
     split, squares = filmed(block=True)
     few = Split(split.names[::every], Camera(*(x[::every] for x in split.cameras)), split.images[::every])
-    seeds = find_seeds(surfaces(), few, MANY)
+    seeds = find_seeds(surfaces(), few, KNOTS, MANY)
     for index, square in enumerate(squares[::every]):
         assert covered_share(square, places(seeds, few, index)) > 0.9
 
@@ -105,7 +105,7 @@ def test_what_sets_off_slowly_is_followed_back_to_where_it_rested():
     images = 0.2 * np.stack(pictures) + np.random.default_rng(0).normal(0, 0.004, (COUNT, HEIGHT, WIDTH, 3))
     cameras = Camera(np.stack(views).astype(np.float32), *filmed(block=True)[0].cameras[1:])
     split = Split(tuple(map(str, range(COUNT))), cameras, np.clip(images, 0, 1).astype(np.float16))
-    seeds = find_seeds(surfaces(), split, MANY)
+    seeds = find_seeds(surfaces(), split, KNOTS, MANY)
     for frame in (0, rest - 2):
         at = places(seeds, split, frame)
         assert cv2.dilate(squares[frame].astype(np.uint8), np.ones((9, 9), np.uint8))[at].mean() > 0.85
@@ -120,11 +120,11 @@ def test_seeds_have_the_colours_of_the_moving_square():
 
 
 def test_where_nothing_moves_there_are_no_seeds():
-    assert len(find_seeds(surfaces(), filmed(block=False)[0], MANY).points) < 0.03 * len(found().points)
+    assert len(find_seeds(surfaces(), filmed(block=False)[0], KNOTS, MANY).points) < 0.03 * len(found().points)
 
 
 def test_the_number_of_seeds_is_limited_and_the_longest_lived_are_kept():
-    few = find_seeds(surfaces(), filmed(block=True)[0], 20)
+    few = find_seeds(surfaces(), filmed(block=True)[0], KNOTS, 20)
     length = lambda seeds: seeds.lifetimes[:, 1] - seeds.lifetimes[:, 0]
     assert len(few.points) == 20
     assert length(few).min() >= np.sort(length(found()))[-60]
@@ -133,7 +133,7 @@ def test_the_number_of_seeds_is_limited_and_the_longest_lived_are_kept():
 def test_seeds_of_the_first_and_of_the_last_frame_are_visible_before_and_after_these():
     split = filmed(block=True)[0]
     cameras = split.cameras._replace(time=np.linspace(0.1, 0.9, COUNT, dtype=np.float32))
-    first, last = find_seeds(surfaces(), dataclasses.replace(split, cameras=cameras), MANY).lifetimes.T
+    first, last = find_seeds(surfaces(), dataclasses.replace(split, cameras=cameras), KNOTS, MANY).lifetimes.T
     visible = lambda time: np.count_nonzero((first <= time) & (time <= last))
     assert visible(0.0) == visible(cameras.time[0]) > 0
     assert visible(1.0) == visible(cameras.time[-1]) > 0
@@ -156,7 +156,7 @@ def measured(split, squares):
 
 def test_seeds_lie_where_measured_depth_puts_them():
     split, squares = filmed(block=True)
-    seeds = find_seeds(surfaces(), dataclasses.replace(split, depths=measured(split, squares)), MANY)
+    seeds = find_seeds(surfaces(), dataclasses.replace(split, depths=measured(split, squares)), KNOTS, MANY)
     error = lambda seeds: np.abs(seeds.points[:, 2] - SQUARE)
     assert np.quantile(error(seeds), 0.8) < 0.05 < 0.5 * np.median(error(found()))
 
@@ -171,15 +171,15 @@ def test_without_reliable_flow_or_depth_there_are_no_seeds(why):
         points = points - np.float32([0, 0, 100])
     else:
         split = dataclasses.replace(split, valid=np.zeros(split.images.shape[:3], bool))
-    seeds = find_seeds(points, split, MANY)
-    assert [x.shape for x in seeds] == [(0, 3), (0, 3), (0,), (0, path_knots(COUNT), 3), (0, 2)]
+    seeds = find_seeds(points, split, KNOTS, MANY)
+    assert [x.shape for x in seeds] == [(0, 3), (0, 3), (0,), (0, KNOTS, 3), (0, 2)]
 
 
 TWO_SEEDS = Seeds(
     points=np.array([[0.1, 0.2, 2.5], [-0.3, 0.1, 2.2]], np.float32),
     colors=np.array([[0.1, 0.12, 0.11], [0.2, 0.1, 0.05]], np.float32),
     spacings=np.array([0.1, 0.2], np.float32),
-    paths=np.random.default_rng(0).uniform(-0.2, 0.2, (2, path_knots(FRAMES), 3)).astype(np.float32),
+    paths=np.random.default_rng(0).uniform(-0.2, 0.2, (2, path_knots(ModelConfig(), FRAMES), 3)).astype(np.float32),
     lifetimes=np.array([[0, 0.5], [0.3, 1]], np.float32),
 )
 
@@ -188,7 +188,7 @@ TWO_SEEDS = Seeds(
 def tracked(monkeypatch):
     """Settings and an initial state with the two seeds."""
     module = sys.modules["l2dgs_jax.training.initial_state"]  # its function has the same name
-    monkeypatch.setattr(module, "find_seeds", lambda *_, most: TWO_SEEDS)
+    monkeypatch.setattr(module, "find_seeds", lambda *_: TWO_SEEDS)
     config = tiny(coarse_steps=3, fine_steps=0)
     config = dataclasses.replace(config, model=dataclasses.replace(config.model, tracks=True))
     return config, initial_state(make_dataset(), config)
@@ -211,7 +211,7 @@ def test_a_training_starts_with_the_seeds_after_the_points(tracked):
 def test_the_largest_number_of_gaussians_limits_the_seeds(tracked, monkeypatch):
     asked = []
     module = sys.modules["l2dgs_jax.training.initial_state"]
-    monkeypatch.setattr(module, "find_seeds", lambda *_, most: asked.append(most) or TWO_SEEDS)
+    monkeypatch.setattr(module, "find_seeds", lambda *given: asked.append(given[-1]) or TWO_SEEDS)
     for limit in (5, 10**6):
         initial_state(make_dataset(), overrides.replace(tracked[0], {"density.max_gaussians": limit}))
     assert asked[0] == 5 < asked[1] < 10**6  # the second by the number of pixels
@@ -295,4 +295,4 @@ def test_the_outline_of_what_is_valid_does_not_move():
     lens = np.hypot(row - HEIGHT / 2, column - WIDTH / 2) < 0.45 * HEIGHT
     images = np.where(lens[..., None], split.images, 0).astype(np.float16)
     valid = np.broadcast_to(lens, images.shape[:3]).copy()
-    assert not len(find_seeds(surfaces(), dataclasses.replace(split, images=images, valid=valid), MANY).points)
+    assert not len(find_seeds(surfaces(), dataclasses.replace(split, images=images, valid=valid), KNOTS, MANY).points)

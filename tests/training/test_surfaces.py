@@ -150,13 +150,15 @@ def test_triangulation_finds_depths_in_spite_of_false_matches(scale):
     np.testing.assert_allclose(depth[:150], truth[:150], rtol=1e-3)
 
 
-def test_training_starts_from_the_added_points_too(monkeypatch):
+@pytest.mark.parametrize("illumination", [None, 0.5])
+def test_training_starts_from_the_added_points_too(monkeypatch, illumination):
     dataset = make_dataset()
+    dataset = dataclasses.replace(dataset, colors=np.full(dataset.points.shape, 0.5))
     added = np.random.default_rng(0).uniform([-1, -0.7, 2], [1, 0.7, 3], (7, 3)).astype(np.float32)
     monkeypatch.setattr(sys.modules[initial_state.__module__], "find_surfaces", lambda *_, most: added[:most])
     config = tiny()
-    with_them = dataclasses.replace(config, model=dataclasses.replace(config.model, surfaces=True))
-    after = initial_state(dataset, with_them).scene
+    model = dataclasses.replace(config.model, surfaces=True, initial_illumination=illumination)
+    after = initial_state(dataset, dataclasses.replace(config, model=model)).scene
     assert int(after.alive.sum()) == len(dataset.points) + len(added)
     means = np.asarray(after.params.gaussians.means[after.alive])
     assert all(np.isclose(means, point, atol=1e-6).all(-1).any() for point in added)
