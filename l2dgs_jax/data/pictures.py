@@ -60,6 +60,7 @@ def stored_if_any(root: Path, downscale: int, names: Sequence[str], all_or_none:
 def copies(scene: Path, root: Path, downscale: int, files: Mapping[str, str]) -> list[Picture]:
     """Each frame's picture in `root`, or in `<root>_<k>` beside it for the largest such k that divides `downscale`.
 
+    Copies that are called otherwise than the frames belong to these in the order of names, if there are equally many.
     Folders `<root>_<k>` are ignored if `root` is the scene's own folder, because they would lie outside the scene.
 
     Args:
@@ -76,6 +77,10 @@ def copies(scene: Path, root: Path, downscale: int, files: Mapping[str, str]) ->
     scale = next((k for k in factors if root.with_name(f"{root.name}_{k}").is_dir()), 1)
     folder = root if scale == 1 else root.with_name(f"{root.name}_{scale}")
     found = by_name(folder)
+    if scale > 1 and not found.keys() & files.keys():  # as in LLFF's own scenes, where copies are numbered
+        originals = by_name(root)
+        if len(originals) == len(found):
+            found = dict(zip(sorted(originals), (found[name] for name in sorted(found)), strict=True))
     missing = [name for name in files if name not in found]
     if missing:
         raise UserError(

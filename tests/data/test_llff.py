@@ -90,3 +90,13 @@ def test_a_fault_is_named_in_one_sentence(scene, fault):
     assert message in str(caught.value)
     assert "expected" in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_smaller_copies_that_are_numbered_belong_to_the_pictures_in_order(scene):
+    for i in range(9):
+        write_image(scene / "images_2" / f"image{i:03d}.png", np.full((12, 16, 3), i / 10))
+    dataset = data.load_dataset(scene, 2)
+    assert [round(10 * image.mean().item()) for image in dataset.train.images] == [1, 2, 3, 4, 5, 6, 7]
+    (scene / "images_2" / "image003.png").unlink()
+    with pytest.raises(UserError, match="images_2: holds 8 pictures, but none for 7 of the 7 frames"):
+        data.load_dataset(scene, 2)
