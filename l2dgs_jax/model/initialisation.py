@@ -2,7 +2,7 @@
 
 import dataclasses
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -79,7 +79,7 @@ def initialise(
 
     Scales are the root mean square distance to the three nearest points, illumination the luminance of the point
     (mid-grey without colours) unless `cfg.initial_illumination` says otherwise, opacity `cfg.initial_opacity`,
-    reflectance and attenuation random (paper, section 4).
+    attenuation random, and so is reflectance unless it is given (paper, section 4).
 
     Args:
         key: randomness of reflectance, attenuation, planes and networks.
@@ -113,27 +113,23 @@ def initialise(
     bias = None if cfg.initial_exponents is None else networks.exponent_bias(cfg.initial_exponents)
     min_scale = MIN_SCALE * length_unit(extent, cfg)
     rim = (1 - cfg.box_points) / 2
-    arrays: tuple = (
-        points,
-        np.quantile(points, [rim, 1 - rim], axis=0),
-        np.log(np.maximum(np.sqrt(mean_square), min_scale)),
-        illumination - cfg.illumination_offset,
-        np.full(count, logit(cfg.initial_opacity)),
-        reflectance,
-        bias,
-        extent,
-        exposures,
-        curve,
-        paths,
-        lifetimes,
-    )
-    return _initialise(
-        key,
-        *(None if x is None else jnp.asarray(x, float) for x in arrays),
-        cfg=_static_settings(cfg),
-        num_frames=len(cameras.time),
-        capacity=capacity,
-    )
+    given: dict[str, np.ndarray | float | None] = {
+        "points": points,
+        "bounds": np.quantile(points, [rim, 1 - rim], axis=0),
+        "log_scales": np.log(np.maximum(np.sqrt(mean_square), min_scale)),
+        "illumination": illumination - cfg.illumination_offset,
+        "logit_opacities": np.full(count, logit(cfg.initial_opacity)),
+        "extent": extent,
+        "reflectance": reflectance,
+        "exponent_bias": bias,
+        "exposures": exposures,
+        "curve": curve,
+        "paths": paths,
+        "lifetimes": lifetimes,
+    }
+    start: dict[str, Any] = {name: None if x is None else jnp.asarray(x, float) for name, x in given.items()}
+    settings, num_frames = _static_settings(cfg), len(cameras.time)
+    return _initialise(key, _Start(**start), cfg=settings, num_frames=num_frames, capacity=capacity)
 
 
 def scene_shapes(cfg: ModelConfig, num_frames: int) -> Scene:
@@ -143,12 +139,23 @@ def scene_shapes(cfg: ModelConfig, num_frames: int) -> Scene:
         cfg: shape of the scene.
         num_frames: training frames.
     """
-    shapes: tuple = ((1, 3), (2, 3), (1,), (1,), (1,), (1, 3), (2,), (), (num_frames, 3), (RAMPS,))
-    if cfg.tracks:
-        shapes += ((1, path_knots(cfg, num_frames), 3), (1, 2))
-    rows = [jax.ShapeDtypeStruct(shape, jnp.zeros(()).dtype) for shape in shapes]
+    array: Any = lambda *shape: jax.ShapeDtypeStruct(shape, jnp.zeros(()).dtype)
+    start = _Start(
+        points=array(1, 3),
+        bounds=array(2, 3),
+        log_scales=array(1),
+        illumination=array(1),
+        logit_opacities=array(1),
+        extent=array(),
+        reflectance=array(1, 3),
+        exponent_bias=array(2),
+        exposures=array(num_frames, 3),
+        curve=array(RAMPS),
+        paths=array(1, path_knots(cfg, num_frames), 3) if cfg.tracks else None,
+        lifetimes=array(1, 2) if cfg.tracks else None,
+    )
     build = partial(_initialise, cfg=_static_settings(cfg), num_frames=num_frames, capacity=1)
-    return jax.eval_shape(build, jax.eval_shape(lambda: jax.random.key(0)), *rows)
+    return jax.eval_shape(build, jax.eval_shape(lambda: jax.random.key(0)), start)
 
 
 def _static_settings(cfg: ModelConfig) -> ModelConfig:
@@ -164,67 +171,80 @@ def _static_settings(cfg: ModelConfig) -> ModelConfig:
     )
 
 
-@partial(jax.jit, static_argnames=("cfg", "num_frames", "capacity"))
-def _initialise(
-    key: PRNGKeyArray,
-    points: Float[Array, "P 3"],
-    bounds: Float[Array, "2 3"],
-    log_scales: Float[Array, " P"],
-    illumination: Float[Array, " P"],
-    logit_opacities: Float[Array, " P"],
-    reflectance: Float[Array, "P 3"] | None,
-    exponent_bias: Float[Array, "2"] | None,
-    extent: Float[Array, ""],
-    exposures: Float[Array, "F 3"] | None,
-    curve: Float[Array, " R"] | None,
-    paths: Float[Array, "T K 3"] | None = None,
-    lifetimes: Float[Array, "P 2"] | None = None,
-    *,
-    cfg: ModelConfig,
-    num_frames: int,
-    capacity: int,
-) -> Scene:
-    """See `initialise`; `illumination` is what the spherical harmonics are to give, without their offset.
+class _Start(NamedTuple):
+    """Arrays that a scene of P Gaussians starts from; see `initialise`.
 
-    The Gaussians of finite lifetime, which come last, follow the first of the paths one by one.
+    Attributes:
+        points: centres, world units.
+        bounds: of the HexPlane's box.
+        log_scales: logarithms of scales, world units.
+        illumination: what the spherical harmonics are to give, without their offset.
+        logit_opacities: logits of opacities.
+        extent: see `Scene`.
+        reflectance: random if not given.
+        exponent_bias: of BAFE-Net's last layer, if it is to start with certain exponents.
+        exposures: logarithms of the gains of F frames.
+        curve: tone curve of all frames.
+        paths: T of them, of which those of finite lifetime, which come last, follow the first ones one by one.
+        lifetimes: see `Gaussians`.
     """
-    count, num_rest = len(points), (cfg.sh_degree + 1) ** 2 - 1
+
+    points: Float[Array, "P 3"]
+    bounds: Float[Array, "2 3"]
+    log_scales: Float[Array, " P"]
+    illumination: Float[Array, " P"]
+    logit_opacities: Float[Array, " P"]
+    extent: Float[Array, ""]
+    reflectance: Float[Array, "P 3"] | None
+    exponent_bias: Float[Array, "2"] | None
+    exposures: Float[Array, "F 3"] | None
+    curve: Float[Array, " R"] | None
+    paths: Float[Array, "T K 3"] | None
+    lifetimes: Float[Array, "P 2"] | None
+
+
+@partial(jax.jit, static_argnames=("cfg", "num_frames", "capacity"))
+def _initialise(key: PRNGKeyArray, start: _Start, *, cfg: ModelConfig, num_frames: int, capacity: int) -> Scene:
+    """See `initialise`."""
+    count, num_rest = len(start.points), (cfg.sh_degree + 1) ** 2 - 1
     keys = jax.random.split(key, 6)
     random = {"normal": jax.random.normal, "uniform": jax.random.uniform}
     gaussians = Gaussians(
-        means=points,
+        means=start.points,
         quats=jnp.tile(jnp.array([[1.0, 0.0, 0.0, 0.0]]), (count, 1)),
-        log_scales=jnp.tile(log_scales[:, None], (1, 3)),
-        logit_opacities=logit_opacities,
-        illumination_dc=illumination[:, None] / SH_DC,
+        log_scales=jnp.tile(start.log_scales[:, None], (1, 3)),
+        logit_opacities=start.logit_opacities,
+        illumination_dc=start.illumination[:, None] / SH_DC,
         illumination_rest=jnp.zeros((count, num_rest)),
-        reflectance=random[cfg.reflectance_init](keys[0], (count, 3)) if reflectance is None else reflectance,
+        reflectance=random[cfg.reflectance_init](keys[0], (count, 3))
+        if start.reflectance is None
+        else start.reflectance,
         attenuation=random[cfg.attenuation_init](keys[1], (count, 2)),
         gate=jnp.full(count, INITIAL_GATE, float) if cfg.motion_gate else None,
-        lifetimes=lifetimes,
+        lifetimes=start.lifetimes,
         color_rest=jnp.zeros((count, 3, num_rest)) if cfg.decomposition != "retinex" else None,
     )
     path_of = None
-    if lifetimes is not None:
-        path_of = jnp.maximum(jnp.cumsum(has_path(lifetimes)) - 1, 0).astype(jnp.int32)
+    if start.lifetimes is not None:
+        path_of = jnp.maximum(jnp.cumsum(has_path(start.lifetimes)) - 1, 0).astype(jnp.int32)
     curves = None
-    if cfg.decomposition == "curve" and curve is not None:
-        curves = ToneCurves(curve, jnp.zeros((num_frames, RAMPS)))
+    if cfg.decomposition == "curve" and start.curve is not None:
+        curves = ToneCurves(start.curve, jnp.zeros((num_frames, RAMPS)))
     params = SceneParams(
         gaussians=jax.tree.map(lambda rows: pad_rows(rows, capacity), gaussians),
         hexplane=hexplane.init(keys[2], cfg, num_frames),
         heads=networks.init_heads(keys[3], cfg.plane_channels * len(cfg.plane_scales), cfg),
         ocd=networks.init_ocd(keys[4], cfg),
-        bafe=networks.init_bafe(keys[5], exponent_bias),
-        paths=paths,
-        exposures=exposures if cfg.exposure == "drifting" else None,
+        bafe=networks.init_bafe(keys[5], start.exponent_bias),
+        paths=start.paths,
+        exposures=start.exposures if cfg.exposure == "drifting" else None,
         curves=curves,
     )
     return Scene(
         params=params,
         alive=jnp.arange(capacity) < count,
-        bounds=bounds,
-        extent=extent,
+        bounds=start.bounds,
+        extent=start.extent,
         path_of=None if path_of is None else pad_rows(path_of, capacity),
     )
 

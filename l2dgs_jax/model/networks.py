@@ -98,21 +98,21 @@ def apply_ocd(ocd: OCDNet, hidden: Float[Array, "*B H"]) -> Float[Array, "*B J"]
     return jax.nn.relu(_affine(ocd.out, _elu(_affine(ocd.hidden, _elu(hidden)))))
 
 
-def init_bafe(key: PRNGKeyArray, exponent_bias: Float[Array, "2"] | None) -> BAFENet:
+def init_bafe(key: PRNGKeyArray, bias: Float[Array, "2"] | None) -> BAFENet:
     """BAFE-Net: Xavier-uniform kernels, zero biases, exponents near 5.5.
 
-    With `exponent_bias` the last layer starts with that bias and a zero kernel, so that the exponents start exactly at
+    With `bias` the last layer starts with that bias and a zero kernel, so that the exponents start exactly at
     the values it stands for; the first step makes the kernel non-zero, and the earlier layers begin to learn.
 
     Args:
         key: randomness of the kernels.
-        exponent_bias: of the last layer, as the function `exponent_bias` returns it; or None.
+        bias: of the last layer, as `exponent_bias` returns it; or None.
     """
     keys = jax.random.split(key, 4)
     norm = lambda channels: GroupNorm(jnp.ones(channels), jnp.zeros(channels))
     out = init_conv(keys[3], 1, 8, 2)
-    if exponent_bias is not None:
-        out = Conv(jnp.zeros_like(out.weight), exponent_bias.astype(out.bias.dtype))
+    if bias is not None:
+        out = Conv(jnp.zeros_like(out.weight), bias.astype(out.bias.dtype))
     return BAFENet(
         conv1=init_conv(keys[0], 5, 2, 8),
         norm1=norm(8),

@@ -25,7 +25,7 @@ class GrowthStats(NamedTuple):
 
 
 class Densified(NamedTuple):
-    """What `densify` returns.
+    """What `densify`, and `relocate` in relocation.py, return.
 
     Attributes:
         gaussians: rows after cloning and splitting.
