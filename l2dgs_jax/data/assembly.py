@@ -93,9 +93,10 @@ def assemble(
     full = _common_size(frames)
     if min(full) < downscale:
         raise UserError(f"--downscale {downscale}: expected at most {min(full)}, the images' shorter side")
-    if _check_pictures([frame.image for frame in frames], full, frames[0].upright):
+    if _check_pictures([frame.image for frame in frames], frames):
         notes = (*notes, LINEAR_NOTE)
-    _check_pictures([frame.mask for frame in frames if frame.mask], full)
+    masked = [frame for frame in frames if frame.mask]
+    _check_pictures([frame.mask for frame in masked if frame.mask], masked)
     width, height = full[0] // downscale, full[1] // downscale
     # Bytes per pixel; masks, which take a sixth of what pictures take, are not counted.
     size = 6 * (1 + (folder / "well").is_dir()) + 4 * any((folder / kind).is_dir() for kind in depth_maps.FOLDERS)
@@ -108,7 +109,8 @@ def assemble(
         )
     held_out, test_notes = _SplitReader(folder, "val", test, width, height, downscale, in_file).read()
     for kind, found in (("well", [learned.welllit, held_out.welllit]), ("mask", [learned.masks, held_out.masks])):
-        if (folder / kind).is_dir() and all(x is None for x in found) and not any(kind in note for note in train_notes):
+        mentioned = any(note.startswith(f"{kind}/") for note in (*train_notes, *test_notes))
+        if (folder / kind).is_dir() and all(x is None for x in found) and not mentioned:
             example = f"{kind}/1x/{frames[0].name}.png"
             notes = (*notes, f"{kind}/ has no picture that is called like a frame, such as {example}: not used")
     return Dataset(
@@ -133,13 +135,14 @@ def _common_size(frames: Sequence[Frame]) -> tuple[int, int]:
     return first.size
 
 
-def _check_pictures(pictures: Sequence[Picture], full: tuple[int, int], upright: bool = True) -> bool:
-    """Check every picture's size against the cameras' full size; returns whether any picture holds linear light."""
+def _check_pictures(pictures: Sequence[Picture], frames: Sequence[Frame]) -> bool:
+    """Check the sizes of pictures of the frames against their cameras'; returns whether any holds linear light."""
     headers = list(_parallel(lambda picture: images.read_header(picture.path), pictures))
-    for picture, header in zip(pictures, headers, strict=True):
+    for picture, header, frame in zip(pictures, headers, frames, strict=True):
         swapped = header.orientation >= 5
-        size = header.size if upright or not swapped else header.size[::-1]
-        _check_size(picture, size, full, " once turned as its EXIF orientation says" if upright and swapped else "")
+        size = header.size if frame.upright or not swapped else header.size[::-1]
+        turned = "once turned" if frame.upright else "without being turned"
+        _check_size(picture, size, frame.size, f" {turned} as its EXIF orientation says" if swapped else "")
     return any(header.linear for header in headers)
 
 
@@ -235,7 +238,7 @@ class _SplitReader:
         if alpha is not None:
             counts = counts & (self._fit(frame, (alpha > 0.5).astype(np.float32), scale)[..., 0] > 0.999)
         if frame.mask:
-            white = (images.read_image(frame.mask.path)[..., :1] > 0.5).astype(np.float32)
+            white = (images.read_image(frame.mask.path, frame.upright)[..., :1] > 0.5).astype(np.float32)
             counts = counts & (self._fit(frame, white, frame.mask.scale)[..., 0] > 0.999)
         return self._fit(frame, image, scale).astype(np.float16), counts
 
@@ -245,12 +248,12 @@ class _SplitReader:
         found, note = stored_if_any(self.folder / kind, self.downscale, names, all_or_none=not as_mask)
         if not found:
             return None, note
-        _check_pictures(found, self.frames[0].size)
+        _check_pictures(found, self.frames)
 
         def read_one(index: int) -> Float16[np.ndarray, "H W 3"] | Bool[np.ndarray, "H W"]:
             picture, frame = found[index], self.frames[index]
             read = images.read_over_black if frame.alpha == "coverage" else images.read_image
-            image = self._fit(frame, read(picture.path), picture.scale).astype(np.float16)
+            image = self._fit(frame, read(picture.path, frame.upright), picture.scale).astype(np.float16)
             return image.mean(-1) > 0.5 if as_mask else image
 
         read_all = _parallel(read_one, range(len(self.frames)))

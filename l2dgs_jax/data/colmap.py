@@ -7,6 +7,7 @@
 Brackets mark what is optional. Alpha 0 marks pixels that do not count.
 """
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -16,8 +17,9 @@ from l2dgs_jax.data import colmap_model, splits
 from l2dgs_jax.data.assembly import Frame, assemble
 from l2dgs_jax.data.colmap_model import ModelCamera, ModelImage
 from l2dgs_jax.data.dataset import Dataset
+from l2dgs_jax.data.images import read_header
 from l2dgs_jax.data.lens import Lens
-from l2dgs_jax.data.pictures import by_name, copies
+from l2dgs_jax.data.pictures import Picture, by_name, copies
 from l2dgs_jax.data.writing import write_lists, write_pictures
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.runtime.files import new_folder
@@ -66,8 +68,8 @@ def read(folder: Path, downscale: int, held_out: str, frame_memory: float) -> Da
             if not (K[0, 0] > 0 and K[1, 1] > 0):
                 raise UserError(f"{model}: camera {image.camera} has no positive focal length; expected one")
             source, size = f"{model}, camera {image.camera}", (camera.width, camera.height)
-            # COLMAP ignores EXIF's orientation.
-            described.append(Frame(name, source, image.viewmat, K, lens, size, times[name], picture, upright=False))
+            upright = _is_turned(picture, size)
+            described.append(Frame(name, source, image.viewmat, K, lens, size, times[name], picture, upright=upright))
         return described
 
     others = sorted(path.name for path in (folder / "sparse").iterdir() if path.is_dir() and path != model)
@@ -112,17 +114,28 @@ def pinhole_and_lens(camera: ModelCamera) -> tuple[Float64[np.ndarray, "3 3"], L
 
 
 def _root(folder: Path, names: list[str]) -> Path:
-    """The folder that the images' names are relative to: `images`, or else the one that holds all of them."""
+    """The folder that the images' names are relative to: `images`, or the scene's own, or the only one that fits."""
     usual = folder / "images"
-    if usual.is_dir():
+    if usual.is_dir() and by_name(usual).keys() & {*names}:
         return usual
-    others = (folder, *sorted(path for path in folder.iterdir() if path.is_dir()))
-    fitting = [other for other in others if {*names} <= by_name(other).keys()]
-    if not fitting:
+    holds_all = lambda other: {*names} <= by_name(other).keys()
+    if usual.is_dir() or holds_all(folder):
+        return folder if holds_all(folder) else usual
+    fitting = {path.name: path for path in sorted(folder.iterdir()) if path.is_dir() and holds_all(path)}
+    copies_of = {name: re.sub(r"_\d+$", "", name) for name in fitting}
+    originals = [path for name, path in fitting.items() if copies_of[name] == name or copies_of[name] not in fitting]
+    if not originals:
         raise UserError(f"{usual}: no such folder; expected the pictures that the model was made from")
-    if len(fitting) > 1:
+    if len(originals) > 1:
         raise UserError(
-            f"{folder}: {fitting[0].name}/ and {fitting[1].name}/ both hold a picture for every image of the model; "
+            f"{folder}: {originals[0].name}/ and {originals[1].name}/ both hold pictures of all images of the model; "
             "expected those that it was made from in images/"
         )
-    return fitting[0]
+    return originals[0]
+
+
+def _is_turned(picture: Picture, size: tuple[int, int]) -> bool:
+    """Whether only once turned as EXIF says a picture fits its camera; COLMAP itself ignores EXIF's orientation."""
+    header = read_header(picture.path)
+    fits = lambda found: all(abs(a - b / picture.scale) < 1 for a, b in zip(found, size, strict=True))
+    return header.orientation >= 5 and fits(header.size) and not fits(header.size[::-1])

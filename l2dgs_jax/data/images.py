@@ -32,36 +32,40 @@ class Header(NamedTuple):
     linear: bool
 
 
-def read_image(path: Path) -> Float32[np.ndarray, "H W 3"]:
-    """Read a grey or colour picture, upright; alpha is dropped, and premultiplied colours are divided by it.
+def read_image(path: Path, upright: bool = True) -> Float32[np.ndarray, "H W 3"]:
+    """Read a grey or colour picture; alpha is dropped, and premultiplied colours are divided by it.
 
     Integers of any bit depth are sRGB values, as cameras write them. Floating-point values (EXR, Radiance HDR, TIFF)
     are linear light unless the file says otherwise: they are clipped to [0, 1] and converted.
 
+    Args:
+        path: the file.
+        upright: whether to turn the picture as its EXIF orientation says.
+
     Raises:
         UserError: the file is missing, cannot be read whole, or holds values that are not finite.
     """
-    return read_image_and_alpha(path)[0]
+    return read_image_and_alpha(path, upright)[0]
 
 
 def read_image_and_alpha(
     path: Path, upright: bool = True
 ) -> tuple[Float32[np.ndarray, "H W 3"], Float32[np.ndarray, "H W 1"] | None]:
-    """Like `read_image`, with the alpha channel if there is one; as it is stored, if not `upright`."""
+    """Like `read_image`, with the alpha channel if there is one."""
     color, alpha, associated, linear = _read(path, upright)
     if alpha is not None and associated:
         color = np.divide(color, alpha, out=color.copy(), where=alpha > 0)
     return _as_srgb(color, linear), alpha
 
 
-def read_over_black(path: Path) -> Float32[np.ndarray, "H W 3"]:
+def read_over_black(path: Path, upright: bool = True) -> Float32[np.ndarray, "H W 3"]:
     """Like `read_image`, but composited over black, before any conversion from linear light to sRGB."""
-    color, alpha, associated, linear = _read(path)
+    color, alpha, associated, linear = _read(path, upright)
     return _as_srgb(color if alpha is None or associated else color * alpha, linear)
 
 
 def _read(
-    path: Path, upright: bool = True
+    path: Path, upright: bool
 ) -> tuple[Float32[np.ndarray, "H W 3"], Float32[np.ndarray, "H W 1"] | None, bool, bool]:
     """Colour as stored, alpha if any, whether colour is premultiplied by alpha, and whether it is linear light."""
     with closing(_open(path)) as file:

@@ -61,7 +61,7 @@ def read(folder: Path, downscale: int, held_out: str, frame_memory: float) -> Da
         return [
             Frame(name, f"{path}, row {names.index(name)}", *described[name], times[name], picture)
             for name, picture in zip(
-                chosen, copies(folder, root, downscale, {name: name for name in chosen}), strict=True
+                chosen, copies(folder, root, downscale, {name: name for name in chosen}, in_order=True), strict=True
             )
         ]
 

@@ -57,10 +57,9 @@ def stored_if_any(root: Path, downscale: int, names: Sequence[str], all_or_none:
     return [], some if has else ""
 
 
-def copies(scene: Path, root: Path, downscale: int, files: Mapping[str, str]) -> list[Picture]:
+def copies(scene: Path, root: Path, downscale: int, files: Mapping[str, str], in_order: bool = False) -> list[Picture]:
     """Each frame's picture in `root`, or in `<root>_<k>` beside it for the largest such k that divides `downscale`.
 
-    Copies that are called otherwise than the frames belong to these in the order of names, if there are equally many.
     Folders `<root>_<k>` are ignored if `root` is the scene's own folder, because they would lie outside the scene.
 
     Args:
@@ -69,6 +68,8 @@ def copies(scene: Path, root: Path, downscale: int, files: Mapping[str, str]) ->
         downscale: what k must divide.
         files: for each frame's name, without a suffix, the path of its file within `root`; where that does not exist, a
             file of another suffix is used.
+        in_order: whether copies that are called otherwise belong to the pictures in the order of names, if they are
+            equally many.
 
     Raises:
         UserError: pictures of frames are missing, or several files could be meant.
@@ -77,7 +78,7 @@ def copies(scene: Path, root: Path, downscale: int, files: Mapping[str, str]) ->
     scale = next((k for k in factors if root.with_name(f"{root.name}_{k}").is_dir()), 1)
     folder = root if scale == 1 else root.with_name(f"{root.name}_{scale}")
     found = by_name(folder)
-    if scale > 1 and not found.keys() & files.keys():  # as in LLFF's own scenes, where copies are numbered
+    if in_order and scale > 1 and not found.keys() & files.keys():
         originals = by_name(root)
         if len(originals) == len(found):
             found = dict(zip(sorted(originals), (found[name] for name in sorted(found)), strict=True))

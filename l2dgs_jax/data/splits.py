@@ -14,6 +14,7 @@ Lists = tuple[list[str], list[str]]  # names to train on, names held out
 NO_LISTS: Lists = ([], [])
 
 _DIGITS = re.compile(r"[0-9]+")
+_CAMERA = re.compile(r"(?<![a-z])(camera|cam|view|c|v)[-_ ]?[0-9]+", re.IGNORECASE)  # "cam01", not "frame01"
 
 
 def check_rule(rule: str) -> None:
@@ -29,7 +30,7 @@ def check_rule(rule: str) -> None:
 def hold_out(
     source: str, names: Sequence[str], own: Lists, rule: str, default: str
 ) -> tuple[list[str], list[str], tuple[str, ...]]:
-    """Names to train on and names held out, and a note if the rule leaves frames out of both.
+    """Names to train on and names held out, and a note if frames are in neither or in both.
 
     Args:
         source: the file that lists the frames, for messages.
@@ -45,12 +46,13 @@ def hold_out(
     """
     notes: tuple[str, ...] = ()
     if rule == "auto" and own[1]:
-        test = list(dict.fromkeys(own[1]))
-        train = [name for name in dict.fromkeys(own[0]) if name not in test]
-        if len(train) < len(own[0]):
-            notes = (
-                f"{source}: {len(own[0]) - len(train)} frames are listed twice; what is held out is not trained on",
-            )
+        train, test = (list(dict.fromkeys(part)) for part in own)
+        unseen = [name for name in train if name not in test]
+        if 2 <= len(unseen) < len(train):
+            notes = (f"{source}: {len(train) - len(unseen)} frames are listed in both ways; they are held out",)
+            train = unseen
+        elif len(unseen) < len(train):
+            notes = (f"{source}: what is held out is also trained on, so its scores are not those of unseen views",)
     else:
         rule = default if rule == "auto" else rule
         if rule == "4dgs":
@@ -84,8 +86,11 @@ def lists(folder: Path) -> tuple[list[str], Lists]:
         train, test = (name_list(file, read_json(file, "a list of frames"), "frame_names") for file in files)
     else:
         ids = name_list(path, content, "ids") if "ids" in content else []
-        train = name_list(path, content, "train_ids") if "train_ids" in content or not ids else []
         test = name_list(path, content, "val_ids") if "val_ids" in content else []
+        if "train_ids" in content or not ids:
+            train = name_list(path, content, "train_ids")
+        else:
+            train = [name for name in ids if name not in test] if test else []
     return ids if {*train, *test} <= {*ids} else sorted({*train, *test}), (train, test)
 
 
@@ -152,7 +157,12 @@ def _from_names(names: Sequence[str]) -> Float[np.ndarray, " F"]:
 def numbers_in(names: Sequence[str]) -> list[int]:
     """The number in each name by which most names differ, counted from the end; empty if a name has none.
 
-    Names may also hold the number of a camera or of a take; of those that tell equally many apart, the last one counts.
+    Numbers of cameras, such as in "cam01_0005", do not count if others differ.
     """
-    found = [[int(digits[-15:]) for digits in reversed(_DIGITS.findall(name))] for name in names]
-    return max(map(list, zip(*found, strict=False)), key=lambda numbers: len(set(numbers)), default=[])
+
+    def most_different(names: Sequence[str]) -> list[int]:
+        found = [[int(digits[-15:]) for digits in reversed(_DIGITS.findall(name))] for name in names]
+        return max(map(list, zip(*found, strict=False)), key=lambda numbers: len(set(numbers)), default=[])
+
+    without_cameras = most_different([_CAMERA.sub("", name) for name in names])
+    return without_cameras if len(set(without_cameras)) > 1 else most_different(names)

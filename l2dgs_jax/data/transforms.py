@@ -54,7 +54,6 @@ def read(folder: Path, downscale: int, held_out: str, frame_memory: float) -> Da
     """
     entries, own, ply = _entries(folder)
     names = list(entries)
-    unread = sorted({"depth_file_path"} & {key for _, content, _ in entries.values() for key in content})
     own = own if own[1] else splits.lists_beside(folder, names)
     train, test, notes = splits.hold_out(str(folder), names, own, held_out, default="8")
     times = _times(folder, entries)
@@ -66,8 +65,8 @@ def read(folder: Path, downscale: int, held_out: str, frame_memory: float) -> Da
         cloud = clouds.in_common_box(np.stack([frame.viewmat for frame in frames.values()]), str(folder)), None
         stand_in = f"{clouds.RANDOM_POINTS} random points where its cameras look stand in for one"
         notes = (*notes, f"{folder} has no point cloud: {stand_in}")
-    if unread:
-        notes = (*notes, f"{folder}: '{unread[0]}' is not read; depth belongs into depth/ (docs/data.md)")
+    if any("depth_file_path" in content for _, content, _ in entries.values()):
+        notes = (*notes, f"{folder}: 'depth_file_path' is not read; depth belongs into depth/ (docs/data.md)")
     return assemble(
         folder, [frames[n] for n in train], [frames[n] for n in test], *cloud, downscale, frame_memory, notes
     )

@@ -47,8 +47,8 @@ class Seeds(NamedTuple):
 
 
 def path_knots(cfg: ModelConfig, num_frames: int) -> int:
-    """How many control points a path has: as many as the motion field has cells in time, but 4 to `MAX_KNOTS`."""
-    return min(max(hexplane.time_cells(cfg, num_frames), 4), MAX_KNOTS)
+    """Control points of a path: as the motion field has cells in time, but 4 to `MAX_KNOTS` or half the frames."""
+    return min(max(min(hexplane.time_cells(cfg, num_frames), num_frames // 2), 4), MAX_KNOTS)
 
 
 def z_order(points: np.ndarray) -> np.ndarray:

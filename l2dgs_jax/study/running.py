@@ -15,11 +15,10 @@ from l2dgs_jax.data.images import write_image
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.runs import Recorder, Run
 from l2dgs_jax.runs.advice import misfit
-from l2dgs_jax.runs.persistence import LESS_MEMORY
 from l2dgs_jax.runs.scores import evaluate
 from l2dgs_jax.runtime import devices, distributed
 from l2dgs_jax.runtime.files import is_taken, make_folder, write_json
-from l2dgs_jax.runtime.locks import locked
+from l2dgs_jax.runtime.locks import LOCK, locked
 from l2dgs_jax.runtime.memory import memory_errors
 from l2dgs_jax.study import report
 from l2dgs_jax.study.grouping import Trial, load_groups
@@ -28,6 +27,7 @@ from l2dgs_jax.training import DivergedError, Member, Progress, engine
 from l2dgs_jax.visualize import contact_sheet
 
 PLANS_FILE = "study.json"  # in the study's folder: its members
+LESS_MEMORY = "fewer --devices, or members of a larger downscale or a smaller batch_size or density.max_gaussians"
 DIVERGED_FILE = "diverged.json"  # in the folder of a member that has diverged and is frozen
 
 
@@ -58,8 +58,9 @@ def run_study(spec: Spec, output: Path, *, resume: bool = False, device_count: i
         distributed.barrier("all scenes are read")
         if first and not resume:  # only now, as a study that cannot start should leave no folder
             make_folder(output)
-            write_json(output / PLANS_FILE, described)
             stack.enter_context(locked(output))
+            _check_folder(output, described, resume)  # another study may have begun there meanwhile
+            write_json(output / PLANS_FILE, described)
         if first:
             _print_notes(groups)
         for index, (group, mesh) in enumerate(zip(groups, meshes, strict=True)):
@@ -94,7 +95,7 @@ def _check_folder(output: Path, described: list[dict], resume: bool) -> None:
             raise UserError(f"{output}: holds no study to resume; expected a folder that sweep wrote") from None
         if held != described:
             raise UserError(f"{output}: holds a study of other members or settings; expected the same file again")
-    elif is_taken(output):
+    elif is_taken(output) and not (output.is_dir() and [path.name for path in output.iterdir()] == [LOCK]):
         raise UserError(f"{output}: already holds a study or files; expected a new folder, or --resume")
 
 

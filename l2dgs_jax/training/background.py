@@ -13,7 +13,7 @@ from l2dgs_jax.data.stacks import evenly_spread, nan_median
 from l2dgs_jax.training.backdrop import Backdrop, hidden_depths, unprojected
 from l2dgs_jax.training.tracks import Tracks
 
-CLIP_PART = 240  # frames of a part of a long clip, which is compared with itself only: not all of the scene is in view
+CLIP_PART = 240  # instants of a part of a long clip, which is compared with itself: elsewhere, little of it is in view
 MAX_FRAMES = 60  # frames of a part that colours of static surfaces are taken from
 MIN_SEEN = 3  # of these, in which a surface must be seen
 REACH = 9  # side in pixels of the square around a track in which static surfaces may be hidden
@@ -54,9 +54,10 @@ def likeness_to_background(
         backdrop: of these.
         tracks: what seems to move there.
     """
-    in_time = np.argsort(backdrop.cameras.time, kind="stable")
+    times, instants = np.unique(backdrop.cameras.time, return_inverse=True)
     likeness = Likeness(*np.zeros((2, len(frames)), bool))
-    for part in np.array_split(in_time, -(-len(in_time) // CLIP_PART)):
+    for span in np.array_split(np.arange(len(times)), -(-len(times) // CLIP_PART)):
+        part = np.flatnonzero(np.isin(instants, span))
         asked = np.isin(frames, part)
         if asked.any():
             here, elsewhere = _colors(frames[asked], pixels[asked], part.tolist(), split, backdrop, tracks)

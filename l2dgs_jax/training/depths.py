@@ -24,6 +24,7 @@ MIN_COLUMNS = 6.0  # at least this distance, pixels
 NEIGHBOUR_WEIGHT = 1.0  # between neighbours, times the similarity of their motion
 CURVATURE_WEIGHT = 1000.0  # second differences along a track
 CHANGE_WEIGHT = 30.0  # first differences along a track
+UNKNOWN_WEIGHT = 1e-3  # where nothing is known, compared with a guess: what else is known about a track then decides
 GIVEN_WEIGHT = 10.0  # depth that came with the scene, compared with a guess
 FLOATING_WEIGHT = 0.3  # being nearer than a guess that comes from no foot
 TYPICAL_ERROR = 0.1  # of the guess, in log-distance
@@ -102,7 +103,7 @@ class _Guess(NamedTuple):
 
     Attributes:
         logs: of the distances.
-        trust: weights of their absolute errors; 0 where nothing is known, and the guess is the mean of all others.
+        trust: weights of their absolute errors; small where nothing is known, and the guess is the mean of all others.
         floats: whether it comes from no foot.
     """
 
@@ -131,7 +132,7 @@ def _first_guess(
     is_given = np.isfinite(given)
     logs = np.log(np.where(is_given, given, guess))
     known = np.isfinite(logs)
-    trust = TYPICAL_ERROR * known * np.where(is_given, GIVEN_WEIGHT, 1)
+    trust = TYPICAL_ERROR * np.where(known, 1, UNKNOWN_WEIGHT) * np.where(is_given, GIVEN_WEIGHT, 1)
     return _Guess(np.where(known, logs, logs[known].mean()), trust, np.isnan(stands) & ~is_given)
 
 

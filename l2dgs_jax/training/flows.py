@@ -52,11 +52,10 @@ def neighbour_flows(split: Split, *, filled: bool = False) -> Flows:
         for size in SMOOTH_FLOW_SIZES if filled else ():
             smooth = _consistent(smooth_flow(first, second, size), smooth_flow(second, first, size))
             found = np.where(np.isfinite(found), found, smooth)
+        trusted = np.full(found.shape[:3], _explains(first, second, found[0]) and _explains(second, first, found[1]))
         if split.valid is not None:
-            valid = np.stack([_surely_valid(split.valid[index]) for index in (frame, following[frame])])
-            found = np.where(valid[..., None], found, np.float32(np.nan))
-        same_scene = _explains(first, second, found[0]) and _explains(second, first, found[1])
-        return (found if same_scene else np.full_like(found, np.nan)).astype(np.float16)
+            trusted &= np.stack([_surely_valid(split.valid[index]) for index in (frame, following[frame])])
+        return np.where(trusted[..., None], found, np.float32(np.nan)).astype(np.float16)
 
     frames = range(len(greys))
     shape = (len(greys), 2, *greys.shape[1:], 2)

@@ -166,5 +166,5 @@ def compared(
     if batch.valid is None:
         return estimate, batch.images, 1.0
     valid, constant = batch.valid[..., None], jax.lax.stop_gradient(estimate)
-    share = batch.valid.mean(dtype=estimate.dtype)
+    share = jnp.maximum(batch.valid.mean(dtype=estimate.dtype), 1e-6)
     return jnp.where(valid, estimate, constant), jnp.where(valid, batch.images, constant), share

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from l2dgs_jax import data
 from l2dgs_jax.data import colmap, colmap_model, images
 from l2dgs_jax.data.lens import distort
+from l2dgs_jax.data.pictures import by_name
 from l2dgs_jax.errors import UserError
 
 WIDTH, HEIGHT = 96, 72
@@ -130,18 +131,53 @@ def test_other_folders_than_images_do_not_stand_in_for_it(scene):
 def test_folders_that_could_both_be_meant_are_named(scene):
     shutil.move(scene / "images", scene / "frames")
     shutil.copytree(scene / "frames", scene / "masks")
-    with pytest.raises(UserError, match=r"scene: frames/ and masks/ both hold a picture for every image"):
+    with pytest.raises(UserError, match=r"scene: frames/ and masks/ both hold pictures of all images"):
         data.load_dataset(scene)
+
+
+def test_folders_of_smaller_copies_and_backups_are_not_mistaken(scene):
+    expected = data.load_dataset(scene).train.images
+    shutil.move(scene / "images", scene / "frames")
+    shutil.copytree(scene / "frames", scene / "frames_2")
+    assert np.array_equal(data.load_dataset(scene).train.images, expected)
+    shutil.rmtree(scene / "frames_2")
+    for path in (scene / "frames").iterdir():
+        shutil.copyfile(path, scene / path.name)
+    assert np.array_equal(data.load_dataset(scene).train.images, expected)
+
+
+def test_names_may_be_relative_to_the_scene(scene):
+    expected = data.load_dataset(scene)
+    shutil.move(scene / "images", scene / "moved")
+    (scene / "images").mkdir()
+    shutil.move(scene / "moved", scene / "images" / "images")  # the model's names are relative to the outer one
+    root = scene / "images"
+    names = [f"images/{path.stem}" for path in (root / "images").iterdir()]
+    assert colmap._root(root, names) == root
+    assert expected.train.names[0] == "000001"
 
 
 @pytest.mark.parametrize("orientation", [3, 6])
 def test_pictures_are_as_stored_because_colmap_ignores_their_orientation(scene, orientation):
     expected = data.load_dataset(scene).train.images
-    for path in (scene / "images").iterdir():
+    shutil.copytree(scene / "images", scene / "well" / "1x")
+    for path in (*(scene / "images").iterdir(), *(scene / "well" / "1x").iterdir()):
         pixels = oiio.ImageBuf(str(path))
         pixels.specmod().attribute("Orientation", orientation)
         assert pixels.write(str(path))
     assert images.read_header(path).orientation == orientation
+    dataset = data.load_dataset(scene)
+    assert np.array_equal(dataset.train.images, expected)
+    assert np.array_equal(dataset.train.welllit, expected)
+
+
+def test_pictures_of_upright_cameras_are_turned(scene):
+    expected = data.load_dataset(scene).train.images
+    for path in (scene / "images").iterdir():
+        turned = np.rot90(oiio.ImageBuf(str(path)).get_pixels(oiio.UINT8))
+        pixels = oiio.ImageBuf(np.ascontiguousarray(turned))
+        pixels.specmod().attribute("Orientation", 6)
+        assert pixels.write(str(path))
     assert np.array_equal(data.load_dataset(scene).train.images, expected)
 
 
@@ -150,6 +186,7 @@ def test_hidden_files_are_no_pictures(scene):
     (scene / "images" / "._000000.png").write_bytes(b"made by another program")
     write_image(scene / "images" / ".thumbs" / "000000.png", np.ones((3, 4, 3)))
     assert np.array_equal(data.load_dataset(scene).train.images, expected)
+    assert len(by_name(scene / "images")) == 10
 
 
 def test_smaller_copies_of_the_pictures_are_used(scene):

@@ -43,6 +43,9 @@ def test_unknown_rules_are_refused(rule):
         (["a9_10.5", "a9_10.7"], [0, 1]),
         (["0000_0", "0000_1", "0001_0", "0001_1", "0004_0"], [0, 0, 0.25, 0.25, 1]),  # numbers of cameras at the end
         (["0_cam0", "3_cam0", "6_cam1"], [0, 0.5, 1]),
+        ([f"cam{i:02d}/{j}" for i in range(3) for j in (4, 8)], [0, 1] * 3),  # more cameras than instants
+        ([f"t{j}_c{i}" for i in range(3) for j in (4, 8)], [0, 1] * 3),
+        (["cam_1", "cam_2", "cam_5"], [0, 0.25, 1]),  # no camera's number, as no other differs
         (["take7", "take7b", "take7c"], [0, 0.5, 1]),  # all have the same number: by order
         (["1", "2", "x"], [0, 0.5, 1]),  # not all have a number: by order
         (["only"], [0]),
@@ -70,9 +73,14 @@ def test_frames_that_are_listed_twice_are_only_held_out():
     names = [f"{i}" for i in range(6)]
     train, test, notes = splits.hold_out("lists", names, (["0", "1", "2", "2", "3"], ["3", "5", "5"]), "auto", "8")
     assert (train, test) == (["0", "1", "2"], ["3", "5"])
-    assert notes == ("lists: 2 frames are listed twice; what is held out is not trained on",)
+    assert notes == ("lists: 1 frames are listed in both ways; they are held out",)
+    train, test, notes = splits.hold_out("lists", names, (names, names), "auto", "8")
+    assert train == test == names
+    assert "also trained on" in notes[0]
 
 
 def test_all_but_the_frames_held_out_are_trained_on(tmp_path):
     write_json(tmp_path / "dataset.json", {"val_ids": ["b"]})
     assert splits.lists_beside(tmp_path, ["a", "b", "c"]) == (["a", "c"], ["b"])
+    write_json(tmp_path / "dataset.json", {"ids": ["a", "b", "c"], "val_ids": ["b"]})
+    assert splits.lists(tmp_path) == (["a", "b", "c"], (["a", "c"], ["b"]))

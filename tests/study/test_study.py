@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from scenes import write_nerfies
+from scenes import write_json, write_nerfies
 
 from l2dgs_jax import runs, sweep
 from l2dgs_jax.config import PRESETS, overrides
@@ -268,10 +268,23 @@ def test_a_study_mentions_what_is_odd_about_its_scenes_once_and_works_alone(stud
         raise MemoryError
 
     monkeypatch.setattr(running, "_train", train)
-    with pytest.raises(UserError, match="out of memory in group 1 of 1; expected enough"):
+    with pytest.raises(UserError, match="out of memory in group 1 of 1; expected fewer --devices"):
         running.run_study(spec, tmp_path / "out")
     printed = capsys.readouterr().out.splitlines()
     assert [line for line in printed if line.startswith("note: ")] == [
         "note: mask/1x/ has pictures of 5 of 6 frames, but not of '000003': not used"
     ]
     assert sum(line.startswith("warning: blobs: 6 frames are few") for line in printed) == 1
+
+
+def test_a_study_that_has_begun_meanwhile_is_not_overwritten(study, tmp_path, monkeypatch):
+    spec = read(study('scenes = ["demo"]\npreset = "demo"'))
+
+    def load(spec):
+        write_json(tmp_path / "out" / running.PLANS_FILE, ["another"])
+        return []
+
+    monkeypatch.setattr(running, "load_groups", load)
+    with pytest.raises(UserError, match="out: already holds a study"):
+        running.run_study(spec, tmp_path / "out")
+    assert json.loads((tmp_path / "out" / running.PLANS_FILE).read_text()) == ["another"]

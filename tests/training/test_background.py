@@ -100,3 +100,17 @@ def test_a_long_clip_is_compared_part_by_part(monkeypatch):
     assert found(moved, tracks._replace(pixels=places))["shadow"] > 0.95
     monkeypatch.setattr(background, "CLIP_PART", 100)
     assert found(moved, tracks._replace(pixels=places))["shadow"] < 0.9
+
+
+def test_frames_of_several_cameras_count_as_one_instant(monkeypatch):
+    monkeypatch.setattr(background, "CLIP_PART", 3)
+    split, tracks = seen()
+    once = np.repeat(np.arange(6), 2) / 6
+    rig = dataclasses.replace(split, cameras=split.cameras._replace(time=once.astype(np.float32)))
+    expected = likeness_to_background(tracks.frames, tracks.pixels, split, backdrop(split), tracks)
+    monkeypatch.setattr(background, "CLIP_PART", 12)
+    whole = likeness_to_background(tracks.frames, tracks.pixels, split, backdrop(split), tracks)
+    monkeypatch.setattr(background, "CLIP_PART", 3)
+    found = likeness_to_background(tracks.frames, tracks.pixels, rig, backdrop(rig), tracks)
+    np.testing.assert_array_equal(found, whole)
+    assert np.any(np.not_equal(expected, whole))

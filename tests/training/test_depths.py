@@ -222,3 +222,16 @@ def test_what_moves_smoothly_is_where_the_shaking_of_the_camera_tells(amount, fa
 @pytest.mark.parametrize("unit", [0.01, 1000.0])
 def test_depths_do_not_depend_on_the_unit_of_length(unit):
     assert_allclose(shaken(0.01, 3.0, unit=unit), shaken(0.01, 3.0), rtol=1e-3)
+
+
+@pytest.mark.parametrize("length", [FRAMES, 2])
+def test_what_nothing_is_known_about_is_as_far_away_as_the_rest(length):
+    depths = cells()
+    depths[:, :, WIDTH // DEPTH_CELL // 2 :] = np.nan
+    unknown = Tracks(*(x[:length] for x in track(1, (28.5, 4.5), (0, 0.5))))
+    merged = Tracks(*(np.concatenate(parts) for parts in zip(track(0, (4.5, 4.5), (0, 0.5)), unknown, strict=True)))
+    count = len(merged.frames)
+    rays = pixel_rays(merged.pixels, np.broadcast_to(np.eye(4), (count, 4, 4)), np.broadcast_to(K, (count, 3, 3)))
+    hidden, nothing = depths_at(depths, merged.frames, merged.pixels).astype(float), np.full(count, np.nan)
+    sights = Sights(merged.frames / FRAMES, np.zeros((count, 3)), rays, np.ones(count), hidden, nothing, nothing)
+    assert_allclose(shared_depths(merged, sights, np.zeros((2, 0), int), 200.0), 2, rtol=0.02)

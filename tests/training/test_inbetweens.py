@@ -228,3 +228,13 @@ def test_a_training_with_inbetweens_resumes_exactly():
     states = [jax.device_get(state_of(progress)) for progress in steps]
     resumed = state_of(finish(dataset, config, jax.tree.map(jnp.asarray, states[1])))
     assert_equal_states(resumed, states[-1])
+
+
+def test_pixels_that_are_not_valid_do_not_make_a_cut(split):
+    noise = np.random.default_rng(0).normal(0, 0.01, split.images.shape)
+    valid = np.ones(split.images.shape[:3], bool)
+    valid[:, :, :8] = valid[:, :, -8:] = False
+    images = np.where(valid[..., None], split.images + noise, 0).astype(np.float16)
+    flows = neighbour_flows(dataclasses.replace(split, images=images, valid=valid))
+    np.testing.assert_array_equal(flows.following, [4, 3, 2, 0, 2])
+    assert np.isnan(flows.displacements[:, :, :, :8]).all()
