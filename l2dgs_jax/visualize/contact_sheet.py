@@ -11,9 +11,9 @@ from l2dgs_jax.runs.run import Run
 from l2dgs_jax.visualize import display
 from l2dgs_jax.visualize.sheet import sheet
 
-COLUMNS = ("input", "re-lit low light", "well-lit", "truth", "L", "R", "B1", "B2", "depth")
+COLUMNS = ("input", "low-light", "well-lit", "truth", "L", "R", "B1", "B2", "depth")
 RENDERED: dict[str, Output] = {
-    "re-lit low light": "lowlight",
+    "low-light": "lowlight",
     "well-lit": "welllit",
     "L": "illumination",
     "R": "reflectance",

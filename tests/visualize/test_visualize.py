@@ -59,7 +59,7 @@ def test_contact_sheet_shows_every_part_of_the_render(run):
         np.testing.assert_array_equal(cell(row, "input"), expected(test.images[i]))
         np.testing.assert_array_equal(cell(row, "truth"), expected(test.welllit[i]))
         np.testing.assert_array_equal(cell(row, "well-lit"), expected(images.welllit))
-        np.testing.assert_array_equal(cell(row, "re-lit low light"), expected(images.lowlight))
+        np.testing.assert_array_equal(cell(row, "low-light"), expected(images.lowlight))
         np.testing.assert_array_equal(cell(row, "R"), expected(images.reflectance))
         for column, values in (("B1", images.attenuation[..., 0]), ("B2", images.attenuation[..., 1])):
             # Brighter in the picture where it is larger: viridis gains green with every step.
