@@ -227,7 +227,7 @@ class _SplitReader:
         """A low-light image, and which of its pixels count."""
         scale, alpha = frame.image.scale, None
         if frame.alpha == "coverage":
-            image = images.read_over_black(frame.image.path)
+            image = images.read_over_black(frame.image.path, frame.upright)
         else:
             image, alpha = images.read_image_and_alpha(frame.image.path, frame.upright)
         counts = np.ones((self.height, self.width), bool)

@@ -119,11 +119,13 @@ def _root(folder: Path, names: list[str]) -> Path:
     if usual.is_dir() and by_name(usual).keys() & {*names}:
         return usual
     holds_all = lambda other: {*names} <= by_name(other).keys()
-    if usual.is_dir() or holds_all(folder):
-        return folder if holds_all(folder) else usual
+    if holds_all(folder):
+        return folder
+    if usual.is_dir():
+        return usual
     fitting = {path.name: path for path in sorted(folder.iterdir()) if path.is_dir() and holds_all(path)}
-    copies_of = {name: re.sub(r"_\d+$", "", name) for name in fitting}
-    originals = [path for name, path in fitting.items() if copies_of[name] == name or copies_of[name] not in fitting]
+    is_copy = lambda name: re.sub(r"_\d+$", "", name) in fitting.keys() - {name}
+    originals = [path for name, path in fitting.items() if not is_copy(name)]
     if not originals:
         raise UserError(f"{usual}: no such folder; expected the pictures that the model was made from")
     if len(originals) > 1:

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Float32, Shaped, UInt8
 
 from l2dgs_jax.data.color import linear_to_srgb
 from l2dgs_jax.errors import UserError
-from l2dgs_jax.runtime.files import expect_room, replacing
+from l2dgs_jax.runtime.files import replacing, reserve
 
 FILE_OVERHEAD = 2**16  # bytes of a picture's file beside its pixels, at most
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".exr", ".hdr", ".bmp")
@@ -115,7 +115,8 @@ def write_image(path: Path, image: Shaped[np.ndarray, "H W *C"]) -> None:
     pixels = oiio.ImageBuf(np.ascontiguousarray(image))
     pixels.specmod().attribute("oiio:UnassociatedAlpha", 1)
     with replacing(path) as temporary:
-        expect_room(temporary, image.nbytes * 17 // 16 + FILE_OVERHEAD)  # OpenImageIO says nothing if the disk is full
+        with open(temporary, "wb") as file:  # OpenImageIO, which writes it anew, says nothing if the disk is full
+            reserve(file.fileno(), image.nbytes * 17 // 16 + FILE_OVERHEAD)
         if not pixels.write(str(temporary)):
             reason = _reason(f"{pixels.geterror()} {oiio.geterror()}")
             raise UserError(f"{path}: cannot be written ({reason}); expected a picture's suffix and a writable folder")

@@ -2,7 +2,6 @@
 
 import math
 import mmap
-import os
 import tempfile
 from collections.abc import Iterable
 from typing import Any
@@ -12,6 +11,7 @@ from jaxtyping import Bool, Float, Int, Shaped
 from numpy.typing import DTypeLike
 
 from l2dgs_jax.errors import UserError
+from l2dgs_jax.runtime.files import reserve
 
 
 class MappedArray(np.ndarray):
@@ -51,8 +51,7 @@ def stacked(
         return stack
     try:
         with tempfile.TemporaryFile() as file:
-            if hasattr(os, "posix_fallocate"):  # so that a full disk is noticed before the first frame is made
-                os.posix_fallocate(file.fileno(), 0, size)
+            reserve(file.fileno(), size)
             for _, frame in zip(range(shape[0]), frames, strict=True):
                 file.write(np.ascontiguousarray(frame, dtype).data)
             file.flush()

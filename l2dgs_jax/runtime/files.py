@@ -36,15 +36,14 @@ def replacing(path: Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
-def expect_room(path: Path, size: int) -> None:
-    """Check that a new file of that many bytes would fit onto the disk; leaves it there, to be written over.
+def reserve(descriptor: int, size: int) -> None:
+    """Reserve that many bytes for an open file, where the system can: a full disk is noticed before any is written.
 
     Raises:
-        OSError: it does not fit.
+        OSError: they do not fit onto the disk.
     """
-    with open(path, "wb") as file:
-        if hasattr(os, "posix_fallocate"):
-            os.posix_fallocate(file.fileno(), 0, size)
+    if hasattr(os, "posix_fallocate"):
+        os.posix_fallocate(descriptor, 0, size)
 
 
 def append_line(path: Path, line: str) -> None:

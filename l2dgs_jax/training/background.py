@@ -94,10 +94,10 @@ def _colors(
         column, row = pixels[asked].astype(int).T
         here[asked] = light[row, column]
         if frame in chosen:
-            shown = np.zeros((height, width), np.uint8)
+            moving = np.zeros((height, width), np.uint8)
             column, row = tracks.pixels[tracks.frames == frame].astype(int).T
-            shown[row, column] = 1
-            light[cv2.dilate(shown, np.ones((REACH, REACH), np.uint8)) > 0] = np.nan
+            moving[row, column] = 1
+            light[cv2.dilate(moving, np.ones((REACH, REACH), np.uint8)) > 0] = np.nan
             places, depth = project_points(surfaces, viewmats[frame], Ks[frame])
             seen = np.flatnonzero((depth > 0) & ((places >= 0) & (places < (width, height))).all(-1))  # never NaN
             column, row = places[seen].astype(int).T
