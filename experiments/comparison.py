@@ -1,8 +1,8 @@
 """`python -m experiments.comparison STUDY OUT.html`: the same views by all methods of a study, side by side.
 
 Makes a self-contained page: for every scene the dark input, each variant's well-lit view and the ground truth, with a
-slider over time, a curtain between any two of them, and an enlarged part of all. STUDY is a folder that `sweep`, or one
-of the scripts for the paper's tables, has filled.
+slider over time, a curtain between any two of them, an enlarged part of all, depth, and a plot of the trainings. STUDY
+is a folder that `sweep`, or one of the scripts for the paper's tables, has filled.
 """
 
 import sys
@@ -21,14 +21,16 @@ from l2dgs_jax.data.images import encode_jpeg, to_bytes
 from l2dgs_jax.data.parsing import read_json, value
 from l2dgs_jax.data.stacks import evenly_spread
 from l2dgs_jax.errors import UserError
-from l2dgs_jax.runs import open_run
+from l2dgs_jax.runs import open_run, read_metrics
 from l2dgs_jax.runs.views import views
 from l2dgs_jax.runtime import command_line
 from l2dgs_jax.runtime.pages import data_url
 from l2dgs_jax.study import report
 from l2dgs_jax.types import Camera
+from l2dgs_jax.visualize import display
 
 JPEG_QUALITY = 92
+CURVE_POINTS = 60  # of the plot of a training
 INPUT, TRUTH = "input", "truth"  # names on the page of the pictures that no member rendered
 
 
@@ -54,7 +56,8 @@ def main(arguments: Sequence[str]) -> None:
     if options.output.is_dir() or not options.output.parent.is_dir():
         raise UserError(f"{options.output}: cannot be written; expected a file in an existing folder")
     scenes = _members(options.study)
-    shown = [_scene(options.study, scene, runs, options.views) for scene, runs in scenes.items()]
+    names = report.scene_names(scenes)
+    shown = [_scene(options.study, names[scene], members, options.views) for scene, members in scenes.items()]
     write_page(options.output, Path(__file__).with_suffix(".html"), shown)
     print(f"wrote {options.output}, {options.output.stat().st_size / 2**20:.1f} MiB")
 
@@ -78,25 +81,46 @@ def _members(study: Path) -> dict[str, dict[str, Member]]:
     return scenes
 
 
-def _scene(study: Path, scene: str, members: dict[str, Member], count: int) -> dict[str, Any]:
-    """Pictures of one scene by name, each a list over the same instants."""
+def _scene(study: Path, name: str, members: dict[str, Member], count: int) -> dict[str, Any]:
+    """Pictures and depths of one scene by name, each a list over the same instants, and curves of the trainings."""
     pictures: dict[str, list[str]] = {}
-    split, chosen = None, np.zeros(0, int)
-    for name, member in members.items():
+    depths: dict[str, list[str]] = {}
+    split, chosen, ranges = None, np.zeros(0, int), None
+    for label, member in members.items():
         run = open_run(study / member["name"])
+        own = run.dataset.test
         if split is None:
-            split = run.dataset.test
+            split = own
             in_time = np.argsort(split.cameras.time, kind="stable")
             chosen = in_time[evenly_spread(len(in_time), count)]
             pictures[INPUT] = [_url(to_bytes(split.images[i])) for i in chosen]
-        cameras = Camera(*(x[chosen] for x in split.cameras))
-        pictures[name] = [_url(to_bytes(output.images.welllit)) for output in views(run, cameras)]
+        if own.names != split.names:
+            raise UserError(
+                f"{study / member['name']}: has other held-out views than members before it; expected the same"
+            )
+        outputs = [*views(run, Camera(*(x[chosen] for x in own.cameras)))]
+        ranges = ranges or display.ranges(outputs)
+        for kind, shown in (("welllit", pictures), ("depth", depths)):
+            shown[label] = [_url(display.shown(output, kind, ranges)) for output in outputs]
     assert split is not None
     if split.welllit is not None:
         pictures[TRUTH] = [_url(to_bytes(split.welllit[i])) for i in chosen]
-    times = [float(time) for time in split.cameras.time[chosen]]
-    size = split.images.shape[2:0:-1]
-    return {"name": Path(scene).name, "size": size, "times": times, "pictures": pictures}
+    return {
+        "name": name,
+        "size": split.images.shape[2:0:-1],
+        "times": [float(time) for time in split.cameras.time[chosen]],
+        "pictures": pictures,
+        "depths": depths,
+        "curves": {label: _curve(study / member["name"]) for label, member in members.items()},
+    }
+
+
+def _curve(run: Path) -> list[list[float]]:
+    """Pairs of step and low-light PSNR of a run, means over consecutive lines of its metrics."""
+    pairs = [(line["step"], line["psnr"]) for line in read_metrics(run)]
+    finite = np.array([pair for pair in pairs if np.isfinite(pair).all()]).reshape(-1, 2)
+    parts = np.array_split(finite, min(len(finite), CURVE_POINTS)) if len(finite) else []
+    return [part.mean(0).tolist() for part in parts]
 
 
 def _url(picture: UInt8[np.ndarray, "H W 3"]) -> str:

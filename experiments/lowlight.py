@@ -11,8 +11,8 @@ from typing import Any
 
 import tyro
 
-from experiments.published import LOWLIGHT, Cells
-from experiments.tables import Options, collect, over_scenes, table, trained, write
+from experiments.published import LOWLIGHT
+from experiments.tables import Cells, Options, collect, over_scenes, table, trained, write
 from l2dgs_jax.runtime import command_line
 
 

@@ -3,10 +3,10 @@
 REGIONS = ("dynamic", "static", "overall")
 MEASURES = ("psnr", "ssim", "lpips_alex")  # the paper does not say which network it uses for LPIPS
 
-Cells = dict[str, dict[str, float]]  # scores by region and measure
+Figures = dict[str, dict[str, float]]  # scores by region and measure
 
 
-def _cells(text: str) -> Cells:
+def _cells(text: str) -> Figures:
     """Scores of one row, from its figures in the order of the paper's columns."""
     figures = iter(map(float, text.split()))
     return {region: {measure: next(figures) for measure in MEASURES} for region in REGIONS}
@@ -65,7 +65,7 @@ TABLE3 = {
 }
 
 # From the last paragraph of section 5: scores of the estimate of the low-light input against that input.
-LOWLIGHT: Cells = {
+LOWLIGHT: Figures = {
     "dynamic": {"psnr": 31.28, "ssim": 0.92},
     "static": {"psnr": 32.96, "ssim": 0.96},
     "overall": {"psnr": 31.86, "ssim": 0.94},

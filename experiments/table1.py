@@ -10,8 +10,8 @@ from collections.abc import Sequence
 
 import tyro
 
-from experiments.published import MEASURES, TABLE1, Cells
-from experiments.tables import Options, collect, table, trained, welllit, write
+from experiments.published import MEASURES, TABLE1
+from experiments.tables import Cells, Options, collect, table, trained, welllit, write
 from l2dgs_jax.runtime import command_line
 
 AFTER_GAIN = "psnr_gain"

@@ -9,8 +9,8 @@ from collections.abc import Sequence
 
 import tyro
 
-from experiments.published import TABLE3, Cells
-from experiments.tables import Options, collect, over_scenes, table, trained, welllit, write
+from experiments.published import TABLE3
+from experiments.tables import Cells, Options, collect, over_scenes, table, trained, welllit, write
 from l2dgs_jax.runtime import command_line
 
 

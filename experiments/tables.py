@@ -3,7 +3,7 @@
 import dataclasses
 import json
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,19 +12,28 @@ import numpy as np
 import tyro
 
 from experiments.members import Member, labels, left_out
-from experiments.published import MEASURES, REGIONS, Cells
+from experiments.published import MEASURES, REGIONS
 from l2dgs_jax.config import overrides
+from l2dgs_jax.errors import UserError
 from l2dgs_jax.metrics import Convention, Lpips, Network
 from l2dgs_jax.runs import open_run
 from l2dgs_jax.runs.lpips_weights import find_lpips
 from l2dgs_jax.runs.scores import evaluate
 from l2dgs_jax.runtime import devices
-from l2dgs_jax.runtime.files import replacing, write_json
+from l2dgs_jax.runtime.files import is_taken, replacing, write_json
 from l2dgs_jax.study import report, running
 from l2dgs_jax.study.spec import Spec, read
 
 STUDIES = Path(__file__).parent / "studies"
-TITLES = {"psnr": "PSNR", "ssim": "SSIM", "lpips_alex": "LPIPS", "psnr_gain": "PSNR after gain"}
+Cells = Mapping[str, Mapping[str, float | Sequence[float]]]  # scores by region and measure: one, or one for each seed
+
+TITLES = {
+    "psnr": "PSNR",
+    "ssim": "SSIM",
+    "lpips_alex": "LPIPS",
+    "psnr_gain": "PSNR after gain",
+    "area": "share of pixels",
+}
 CONVENTION: Convention = "paper"  # for scoring regions with LPIPS; for PSNR and SSIM it is the same as the default
 # Settings of a smoke run; QUICK_STEPS is the number of steps of each stage that a member has.
 QUICK_STEPS = 3
@@ -55,14 +64,17 @@ def trained(options: Options, study: str) -> list[Member]:
     """Run or resume a study; returns the results of all its members, as in `results.json`.
 
     Raises:
-        UserError: as `run_study`, or weights of LPIPS cannot be read.
+        UserError: as `run_study`, weights of LPIPS cannot be read, or the folder holds something else.
     """
+    begun = (options.output / running.PLANS_FILE).exists()
+    if is_taken(options.output) and not begun:
+        raise UserError(f"{options.output}: already holds files; expected a new folder, or that of the same command")
     devices.one_per_core()
     lpips = find_lpips({"alex": options.lpips_alex})
     scenes = [scene if scene == "demo" else str(Path(scene).absolute()) for scene in options.scenes]
     spec = read(options.study or STUDIES / study, scenes)
     spec = _quick(spec) if options.quick else spec
-    running.run_study(spec, options.output, resume=(options.output / running.PLANS_FILE).exists())
+    running.run_study(spec, options.output, resume=begun)
     if lpips:
         _score_again(options.output, lpips)
     return _members(options.output)
@@ -96,25 +108,40 @@ def _quick(spec: Spec) -> Spec:
 
 
 def collect(members: Sequence[Member], cells: Callable[[dict[str, Any]], Cells]) -> dict[str, dict[str, Cells]]:
-    """Mean scores over the seeds that did not diverge, by scene and label.
+    """Scores of the seeds that did not diverge, by scene and label.
 
     Args:
         members: of a study.
         cells: selects the scores for a table from all scores of a member.
     """
-    names = labels(members)
+    names, scenes = labels(members), report.scene_names(member["scene"] for member in members)
     groups: dict[str, dict[str, list[Cells]]] = {}
     for member in members:
-        group = groups.setdefault(Path(member["scene"]).name, {}).setdefault(names[member["name"]], [])
+        group = groups.setdefault(scenes[member["scene"]], {}).setdefault(names[member["name"]], [])
         if member["ended"] == report.FINISHED:
             group.append(cells(member["scores"]))
-    return {scene: {label: means(scores) for label, scores in rows.items()} for scene, rows in groups.items()}
+    return {scene: {label: _listed(scores) for label, scores in rows.items()} for scene, rows in groups.items()}
 
 
 def over_scenes(found: dict[str, dict[str, Cells]]) -> dict[str, Cells]:
-    """Means over the scenes, by label."""
+    """Means over the scenes for each seed, by label; none where a row lacks a scene that another row has.
+
+    Otherwise a row that lacks a hard scene, because it diverged there, would look better than the others.
+    """
     rows = dict.fromkeys(label for scores in found.values() for label in scores)
-    return {label: means(scores[label] for scores in found.values() if label in scores) for label in rows}
+    scored: dict[tuple[str, str], set[str]] = defaultdict(set)
+    for scene, scores in found.items():
+        for cells in scores.values():
+            for region, measures in cells.items():
+                for measure in measures:
+                    scored[region, measure].add(scene)
+    means: dict[str, dict[str, dict[str, list[float]]]] = {label: defaultdict(dict) for label in rows}
+    for (region, measure), scenes in scored.items():
+        for label in rows:
+            values = [found[scene].get(label, {}).get(region, {}).get(measure) for scene in scenes]
+            if None not in values:
+                means[label][region][measure] = _mean_over_scenes(values)
+    return means
 
 
 def welllit(scores: dict[str, Any]) -> Cells:
@@ -122,26 +149,33 @@ def welllit(scores: dict[str, Any]) -> Cells:
     return scores.get("welllit", {})
 
 
-def means(scores: Iterable[Cells]) -> Cells:
-    """Means over members, for each region and measure over those that have it."""
+def _listed(scores: Iterable[Cells]) -> Cells:
+    """The scores of all members, for each region and measure those of the members that have it."""
     found: dict[str, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
     for cells in scores:
         for region, measures in cells.items():
             for measure, value in measures.items():
                 if value is not None:
                     found[region][measure].append(float(value))  # "Infinity" is a string in JSON
-    return {
-        region: {measure: float(np.mean(values)) for measure, values in measures.items()}
-        for region, measures in found.items()
-    }
+    return found
+
+
+def _mean_over_scenes(values: Sequence[Sequence[float]]) -> list[float]:
+    """Of each seed, or of the scenes' means if they do not have equally many seeds."""
+    if len({len(seeds) for seeds in values}) > 1:
+        values = [[float(np.mean(seeds))] for seeds in values]
+    return np.mean(values, 0).tolist()
 
 
 def table(rows: Sequence[tuple[str, Sequence[Cells]]], measures: Sequence[str] = MEASURES) -> str:
-    """Markdown with a column for each region and measure; in a cell, all figures but the first are in brackets."""
+    """Markdown with a column for each region and measure, and for the region's share of the pixels.
+
+    Of several seeds, a cell has the mean and half the range. All figures of a cell but the first are in brackets.
+    """
     columns = [
         (region, measure)
         for region in REGIONS
-        for measure in measures
+        for measure in (*measures, "area")
         if any(measure in cells.get(region, {}) for _, parts in rows for cells in parts)
     ]
     lines = [["", *(f"{region} {TITLES[measure]}" for region, measure in columns)]]
@@ -150,13 +184,19 @@ def table(rows: Sequence[tuple[str, Sequence[Cells]]], measures: Sequence[str] =
         shown = []
         for region, measure in columns:
             own, *others = (_text(cells.get(region, {}).get(measure), measure) for cells in parts)
-            shown.append(own + "".join(f" ({other})" for other in others))
+            shown.append(own + "".join(f" ({other})" for other in others if other or measure != "area"))
         lines.append([name, *shown])
     return "".join(f"| {' | '.join(cells)} |\n" for cells in lines)
 
 
-def _text(value: float | None, measure: str) -> str:
-    return "–" if value is None else f"{value:.{1 if 'psnr' in measure else 2}f}"
+def _text(scores: float | Sequence[float] | None, measure: str) -> str:
+    if scores is None:
+        return "" if measure == "area" else "–"
+    if measure == "area":
+        return f"{np.mean(scores):.0%}"
+    digits = 1 if "psnr" in measure else 2
+    spread = f" ± {np.ptp(scores) / 2:.{digits}f}" if np.size(scores) > 1 else ""
+    return f"{np.mean(scores):.{digits}f}{spread}"
 
 
 def write(options: Options, name: str, members: Sequence[Member], content: Any, markdown: str) -> None:
@@ -168,6 +208,9 @@ def write(options: Options, name: str, members: Sequence[Member], content: Any, 
     missing = left_out(members)
     if missing:
         markdown += f"\nLeft out of all means: {', '.join(missing)}.\n"
+    seeds = {member["varied"]["seed"] for member in members}
+    if len(seeds) > 1:
+        markdown += f"\nMeans over {len(seeds)} seeds, ± half of the range.\n"
     if options.quick:
         markdown = f"A smoke run of {QUICK_STEPS} steps a stage: its scores mean nothing.\n\n{markdown}"
     write_json(options.output / f"{name}.json", {"quick": options.quick, "left_out": missing} | content)

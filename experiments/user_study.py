@@ -86,6 +86,9 @@ def main(arguments: Sequence[str]) -> None:
     key = read_json(options.key, "a key that `page` wrote")
     for entry, kind in {"study": str, "methods": list, "key": dict}.items():
         value(options.key, key, entry, kind)
+    for scene, dealt in key["key"].items():
+        if not isinstance(dealt, dict) or sorted(map(str, dealt.values())) != sorted(map(str, key["methods"])):
+            raise UserError(f"{options.key}: does not say which letter of {scene} is which; expected a key of `page`")
     result = aggregate(key, {path: read_json(path, "answers that the page left") for path in options.answers})
     print(markdown(result))
     if options.json is not None:
@@ -171,10 +174,14 @@ def _counts(key: dict[str, Any], path: Path, content: dict[str, Any]) -> tuple[n
     methods = key["methods"]
     chosen, choices = np.zeros((len(methods), len(CRITERIA))), np.zeros(len(CRITERIA))
     rated, ratings = np.zeros_like(chosen), np.zeros_like(chosen)
+    seen = set()
     try:
         for answer in content["answers"]:
-            criterion = range(len(CRITERIA))[answer["criterion"]]
-            dealt = key["key"][answer["scene"]]
+            criterion, scene = answer["criterion"], answer["scene"]
+            if criterion not in range(len(CRITERIA)) or (scene, criterion) in seen:
+                raise ValueError
+            seen.add((scene, criterion))
+            dealt = key["key"][scene]
             if "best" in answer:
                 chosen[methods.index(dealt[answer["best"]]), criterion] += 1
                 choices[criterion] += 1

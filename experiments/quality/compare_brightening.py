@@ -8,6 +8,7 @@ flow and features are found differ.
 
 import argparse
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -15,6 +16,7 @@ import cv2
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.preprocess.capture import CaptureConfig, prepare
 from l2dgs_jax.preprocess.capture.brighten import Tone, brighten
+from l2dgs_jax.runtime import command_line
 
 CURVES = {
     "as they are": lambda image, tone: brighten(image, Tone(1.0, 1.0, 0.0)),
@@ -26,10 +28,10 @@ CURVES = {
 }
 
 
-def main() -> None:
+def main(arguments: Sequence[str]) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("source", type=Path)
-    options = parser.parse_args()
+    options = parser.parse_args(arguments)
     for name, curve in CURVES.items():
         with tempfile.TemporaryDirectory() as folder:
             try:
@@ -42,4 +44,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    command_line.run(main)

@@ -10,6 +10,7 @@ and the largest distance between centres, relative to the trajectory's length, a
 
 import argparse
 import json
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -17,17 +18,19 @@ import numpy as np
 import pycolmap
 from skimage.transform import SimilarityTransform
 
+from l2dgs_jax.runtime import command_line
+
 FPS = 10
 
 
-def main() -> None:
+def main(arguments: Sequence[str]) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("command", choices=("video", "compare"))
     parser.add_argument("scene", type=Path)
     parser.add_argument("target", type=Path)
     parser.add_argument("--pictures", default="rgb/1x", help="folder of the frames within the scene")
     parser.add_argument("--skip", default="_r", help="leave out names that end like this")
-    options = parser.parse_args()
+    options = parser.parse_args(arguments)
     paths = sorted(p for p in (options.scene / options.pictures).iterdir() if not p.stem.endswith(options.skip))
     if options.command == "video":
         make_video(paths, options.target)
@@ -79,4 +82,4 @@ def _frame(origin: str, paths: list[Path]) -> str:
 
 
 if __name__ == "__main__":
-    main()
+    command_line.run(main)

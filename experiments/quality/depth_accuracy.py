@@ -7,7 +7,7 @@ whole clip and for each sixth of it: a positive one means too far away.
 """
 
 import argparse
-from pathlib import Path
+from collections.abc import Sequence
 
 import cv2
 import jax.numpy as jnp
@@ -20,8 +20,10 @@ from l2dgs_jax.cameras.geometry import points_inside
 from l2dgs_jax.config import PRESETS
 from l2dgs_jax.data import Split, load_dataset
 from l2dgs_jax.data.dataset import Dataset
+from l2dgs_jax.errors import UserError
 from l2dgs_jax.model.deformation import path_weights
 from l2dgs_jax.model.initialisation import Seeds, path_knots
+from l2dgs_jax.runtime import command_line
 from l2dgs_jax.training.seeds import find_seeds
 from l2dgs_jax.types import Camera
 
@@ -34,18 +36,22 @@ SMOOTH = 0.02  # relative difference from the median of 5x5 depths up to which a
 PARTS = 6
 
 
-def main() -> None:
+def main(arguments: Sequence[str]) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scenes", type=Path, nargs="+")
+    parser.add_argument("scenes", nargs="+")
     parser.add_argument("--downscale", type=int, default=1)
-    options = parser.parse_args()
+    options = parser.parse_args(arguments)
     for scene in options.scenes:
         seen, full = load_dataset(scene, options.downscale), load_dataset(scene)
+        if full.train.welllit is None or full.test.welllit is None or seen.train.masks is None:
+            raise UserError(f"{scene}: lacks well-lit frames or masks; expected both, and views of the same instants")
         knots = path_knots(PRESETS["default"].model, len(seen.train.names))
         seeds = find_seeds(seen.points, seen.train, knots, most=seen.train.images[0, ..., 0].size)
         found = errors(seeds, seen.train, stereo(full))
+        if not found:
+            raise UserError(f"{scene}: no held-out view shows the instant of a training frame; expected some that do")
         together = np.concatenate(found)
-        print(f"{scene.name}: {summary(together)}; by parts: {', '.join(map(summary, _parts(found)))}")
+        print(f"{seen.name}: {summary(together)}; by parts: {', '.join(map(summary, _parts(found)))}")
 
 
 def summary(errors: Float[np.ndarray, " N"]) -> str:
@@ -119,4 +125,4 @@ def _parts(found: list[Float[np.ndarray, " _"]]) -> list[Float[np.ndarray, " _"]
 
 
 if __name__ == "__main__":
-    main()
+    command_line.run(main)

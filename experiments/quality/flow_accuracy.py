@@ -6,14 +6,16 @@ pixel. Only moving pixels count, by the masks of the scene or, if it has none, b
 """
 
 import argparse
-from pathlib import Path
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float32
 
 from l2dgs_jax.data import Split, load_dataset
+from l2dgs_jax.errors import UserError
 from l2dgs_jax.preprocess.motion_masks import compute_masks
+from l2dgs_jax.runtime import command_line
 from l2dgs_jax.training.flows import neighbour_flows
 from l2dgs_jax.training.inbetweens import draw
 from l2dgs_jax.types import Camera
@@ -21,19 +23,21 @@ from l2dgs_jax.types import Camera
 RIGHT_BELOW = 3.0  # times the median difference
 
 
-def main() -> None:
+def main(arguments: Sequence[str]) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scenes", type=Path, nargs="+")
+    parser.add_argument("scenes", nargs="+")
     parser.add_argument("--downscale", type=int, default=1)
-    options = parser.parse_args()
+    options = parser.parse_args(arguments)
     for scene in options.scenes:
         dataset = load_dataset(scene, options.downscale)
         split = dataset.train
         moving = compute_masks(dataset)[: len(split.names)] if split.masks is None else split.masks
         order = np.argsort(split.cameras.time, kind="stable")
+        if not moving[order[1:-1:2]].any():
+            raise UserError(f"{scene}: nothing moves in it; expected moving pixels between two frames")
         for name, filled in (("by patches", False), ("with smooth flow", True)):
             right, wrong = shares(split, moving, order, filled)
-            print(f"{scene.name}, {name}: {right:.0%} of what moves comes out right, {wrong:.0%} wrong")
+            print(f"{dataset.name}, {name}: {right:.0%} of what moves comes out right, {wrong:.0%} wrong")
 
 
 def shares(split: Split, moving: Bool[np.ndarray, "F H W"], order: np.ndarray, filled: bool) -> np.ndarray:
@@ -64,4 +68,4 @@ def _blurred(image: np.ndarray) -> Float32[np.ndarray, "H W 3"]:
 
 
 if __name__ == "__main__":
-    main()
+    command_line.run(main)

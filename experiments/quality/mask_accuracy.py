@@ -6,23 +6,28 @@ of the moving pixels, as the mean over the frames and over all pixels of all fra
 
 import argparse
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from l2dgs_jax.data import load_dataset
 from l2dgs_jax.data.images import write_image
+from l2dgs_jax.errors import UserError
 from l2dgs_jax.preprocess.motion_masks import compute_masks, preview
+from l2dgs_jax.runtime import command_line
 
 
-def main() -> None:
+def main(arguments: Sequence[str]) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scene", type=Path)
+    parser.add_argument("scene")
     parser.add_argument("--downscale", type=int, default=1)
     parser.add_argument("--preview", type=Path)
-    options = parser.parse_args()
+    options = parser.parse_args(arguments)
 
     dataset = load_dataset(options.scene, options.downscale)
+    if dataset.train.masks is None or dataset.test.masks is None:
+        raise UserError(f"{options.scene}: has no masks of its own; expected some to compare computed ones with")
     begin = time.perf_counter()
     found = compute_masks(dataset)
     print(f"{time.perf_counter() - begin:.0f} s for {len(found)} frames of {dataset.width}x{dataset.height}")
@@ -40,4 +45,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    command_line.run(main)

@@ -8,7 +8,6 @@ combination of settings, there is one table with a row for each scene.
 
 import json
 import sys
-from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +17,11 @@ import numpy as np
 import tyro
 
 from experiments.members import left_out
-from l2dgs_jax.study.report import FINISHED
+from l2dgs_jax.data.parsing import read_json
+from l2dgs_jax.errors import UserError
+from l2dgs_jax.runtime import command_line
+from l2dgs_jax.runtime.files import write_json
+from l2dgs_jax.study import report
 
 Row = tuple[tuple[str, str], ...]  # names and values of settings
 Found = dict[Row, dict[str, dict[str, list[float]]]]  # by settings, scene and name of a score: its values for all seeds
@@ -49,45 +52,67 @@ class Table:
 
 
 def collect(studies: Sequence[Path]) -> Found:
-    """Scores of all studies together; members that diverged are named on standard error and left out."""
-    found: Found = defaultdict(lambda: defaultdict(lambda: defaultdict(list)))
+    """Scores of all studies together; members that diverged are named on standard error and left out.
+
+    Raises:
+        UserError: a study cannot be read, or two have scores of the same settings on the same scene.
+    """
+    found: Found = {}
     for study in studies:
-        if study.is_file():
-            for kept in _kept(study):
-                found[tuple(kept["settings"].items())] |= kept["scenes"]
-            continue
-        members = json.loads((study / "results.json").read_text())["members"]
-        for missing in left_out(members):
-            print(f"{study}: {missing} is left out", file=sys.stderr)
-        for member in members:
-            varied = {name: value for name, value in member["varied"].items() if name != "seed"}
-            row = tuple((name, str(value)) for name, value in varied.items())
-            scores = found[row][Path(member["scene"]).name]
-            for name, path in SCORES.items() if member["ended"] == FINISHED else ():
-                score = _score(member["scores"], path)
-                if score is not None:
-                    scores[name].append(score)
+        for row, scenes in (_kept(study) if study.is_file() else _trained(study)).items():
+            rows = found.setdefault(row, {})
+            for scene in scenes.keys() & rows.keys():
+                raise UserError(
+                    f"{study}: has scores of {_label(row)} on {scene}, as another of these studies; expected each once"
+                )
+            rows |= scenes
     return found
 
 
-def _kept(path: Path) -> list[dict[str, Any]]:
-    """The rows of a file; a row can refer to another file beside it.
+def _trained(study: Path) -> Found:
+    """The scores in a folder that `sweep` has filled."""
+    members = read_json(study / report.JSON, "the results of a study")["members"]
+    for missing in left_out(members):
+        print(f"{study}: {missing} is left out", file=sys.stderr)
+    names = report.scene_names(member["scene"] for member in members)
+    found: Found = {}
+    for member in members:
+        varied = {name: value for name, value in member["varied"].items() if name != "seed"}
+        row = tuple((name, str(value)) for name, value in varied.items())
+        scores = found.setdefault(row, {}).setdefault(names[member["scene"]], {})
+        for name, path in SCORES.items() if member["ended"] == report.FINISHED else ():
+            score = _score(member["scores"], path)
+            if score is not None:
+                scores.setdefault(name, []).append(score)
+    return found
+
+
+def _kept(path: Path) -> Found:
+    """The scores in a file; a row can refer to another file beside it.
 
     It names that file, the index of a row there and, unless it takes all, the scenes that it takes from that row.
+
+    Raises:
+        UserError: the file is not of this kind.
     """
-    rows = json.loads(path.read_text())
-    for row in rows:
-        if isinstance(row["scenes"], list):
-            name, index, *chosen = row["scenes"]
-            scenes = _kept(path.parent / name)[index]["scenes"]
-            row["scenes"] = {scene: scenes[scene] for scene in chosen or scenes}
-    return rows
+    found: Found = {}
+    try:
+        for row in json.loads(path.read_text()):
+            scenes = row["scenes"]
+            if isinstance(scenes, list):
+                name, index, *chosen = scenes
+                referred = [*_kept(path.parent / name).values()][index]
+                scenes = {scene: referred[scene] for scene in chosen or referred}
+            found[tuple(row["settings"].items())] = scenes
+    except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
+        raise UserError(f"{path}: cannot be read ({error!r}); expected numbers that --json has written") from None
+    return found
 
 
 def _score(scores: Any, path: Sequence[str]) -> float | None:
     for key in path:
         scores = scores.get(key) if isinstance(scores, dict) else None
-    return None if scores is None else round(float(scores), 4)
+    return None if scores is None else round(float(scores), 4)  # "Infinity" is a string in JSON
 
 
 def markdown(found: Found) -> str:
@@ -147,15 +172,14 @@ def _cell(name: str, scores: list[float] | None) -> str:
     return f"{np.mean(scores):.{digits}f}{spread}"
 
 
-def main() -> None:
+def main(arguments: Sequence[str]) -> None:
     """Print the table."""
-    options = tyro.cli(Table)
+    options = tyro.cli(Table, args=arguments)
     found = collect(options.studies)
     if options.json is not None:
-        rows = [{"settings": dict(row), "scenes": scenes} for row, scenes in found.items()]
-        options.json.write_text(json.dumps(rows) + "\n")
+        write_json(options.json, [{"settings": dict(row), "scenes": scenes} for row, scenes in found.items()])
     sys.stdout.write(brief(found) if options.brief else markdown(found))
 
 
 if __name__ == "__main__":
-    main()
+    command_line.run(main)

@@ -36,14 +36,29 @@ def ssim_map(
     if border == "mirror":
         edges = [(0, 0)] * (a.ndim - 3) + [(RADIUS, RADIUS)] * 2 + [(0, 0)]
         a, b = (jnp.pad(image, edges, "symmetric") for image in (a, b))
-    # Only the sum of the two variances enters SSIM, so that four blurred images suffice instead of five.
-    mean_a, mean_b, square, product = map(_blur, (a, b, a * a + b * b, a * b))
-    means = mean_a * mean_b
-    mean_squares = mean_a * mean_a + mean_b * mean_b
-    similarity = ((2 * means + C1) * (2 * (product - means) + C2)) / (
-        (mean_squares + C1) * (square - mean_squares + C2)
-    )
+    similarity = _similarity(*map(_blur, (a, b, a * a + b * b, a * b)))
     return similarity if border == "zero" else similarity[..., RADIUS:-RADIUS, RADIUS:-RADIUS, :]
+
+
+def valid_ssim_map(
+    a: Float[Array, "H W C"], b: Float[Array, "H W C"], valid: Bool[Array, "H W"]
+) -> Float[Array, "H W C"]:
+    """`ssim_map` of valid pixels: the others, and those beyond the image, have no weight in its windows."""
+    a, b = (jnp.where(valid[..., None], image, 0) for image in (a, b))
+    weights = jnp.maximum(_blur(valid.astype(a.dtype)[..., None]), jnp.finfo(a.dtype).tiny)
+    return _similarity(*(_blur(x) / weights for x in (a, b, a * a + b * b, a * b)))
+
+
+def _similarity(
+    mean_a: Float[Array, "*B H W C"],
+    mean_b: Float[Array, "*B H W C"],
+    square: Float[Array, "*B H W C"],
+    product: Float[Array, "*B H W C"],
+) -> Float[Array, "*B H W C"]:
+    """SSIM given means over windows: of two images, of the sum of their squares, and of their product."""
+    means = mean_a * mean_b
+    mean_squares = mean_a * mean_a + mean_b * mean_b  # only the sum of the two variances enters SSIM
+    return ((2 * means + C1) * (2 * (product - means) + C2)) / ((mean_squares + C1) * (square - mean_squares + C2))
 
 
 def ssim(a: Float[Array, "*B H W C"], b: Float[Array, "*B H W C"]) -> Float[Array, "*B"]:

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 
 from l2dgs_jax.metrics import lpips
 from l2dgs_jax.metrics.flip import flip_map
-from l2dgs_jax.metrics.images import NO_VALUE, RADIUS, Border, inside, partial_ssim, ssim_map
+from l2dgs_jax.metrics.images import NO_VALUE, RADIUS, Border, inside, partial_ssim, ssim_map, valid_ssim_map
 from l2dgs_jax.metrics.multiscale import ms_ssim_maps, pool
 
 Pixels = Float[np.ndarray, "H W C"]
@@ -25,12 +25,14 @@ class Measure(NamedTuple):
         maps: local values, or `NO_VALUE`, for a prediction and the ground truth, at one or more resolutions.
         score: the score, given the mean of each map, one number per channel.
         masked: the score of a mask's pixels alone; None if it is that of `maps` of images with all else set to black.
+        partial: `maps` from valid pixels alone; None if it is that of images that are equal at all others.
         spread: whether by the convention "paper" a region's score is the whole frame's times its share of the area.
     """
 
     maps: Callable[[Pixels, Pixels], Maps]
     score: Callable[[Sequence[Float[np.ndarray, " _"]]], float]
     masked: Callable[[Pixels, Pixels, Mask], float] | None = None
+    partial: Callable[[Pixels, Pixels, Mask], Maps] | None = None
     spread: bool = False
 
 
@@ -63,10 +65,14 @@ def _ssim(border: Border) -> Callable[[Pixels, Pixels], Maps]:
 
     def maps(a: Pixels, b: Pixels) -> Maps:
         similarity = np.asarray(compiled(a, b))
-        small = min(a.shape[:2]) <= 2 * RADIUS
-        return [similarity if border == "zero" or small else inside(similarity)]
+        return [similarity if border == "zero" else _windows(similarity)]
 
     return maps
+
+
+def _windows(similarity: Float[np.ndarray, "H W C"]) -> Float[np.ndarray, "H W C"]:
+    """A map with values only where the window lies inside the image, unless the image is too small for one."""
+    return similarity if min(similarity.shape[:2]) <= 2 * RADIUS else inside(similarity)
 
 
 def _mean(values: Float[np.ndarray, "H W C"], mask: Mask) -> Float[np.ndarray, " C"]:
@@ -89,10 +95,16 @@ def _total(means: Sequence[Float[np.ndarray, " _"]]) -> float:
     return float(np.sum([mean.mean() for mean in means]))
 
 
-_partial_ssim, _lpips_maps = jax.jit(partial_ssim), jax.jit(lpips.lpips_maps, static_argnums=0)
+_partial_ssim, _valid_ssim_map = jax.jit(partial_ssim), jax.jit(valid_ssim_map)
+_lpips_maps = jax.jit(lpips.lpips_maps, static_argnums=0)
 
 PSNR = Measure(lambda a, b: [(a - b) ** 2], _decibel)
-SSIM = Measure(_ssim("mirror"), _total, lambda a, b, mask: float(_partial_ssim(a, b, mask)))
+SSIM = Measure(
+    _ssim("mirror"),
+    _total,
+    masked=lambda a, b, mask: float(_partial_ssim(a, b, mask)),
+    partial=lambda a, b, valid: [_windows(np.asarray(_valid_ssim_map(a, b, valid)))],
+)
 SSIM_3DGS = Measure(_ssim("zero"), _total)
 MS_SSIM = Measure(ms_ssim_maps, pool)
 FLIP = Measure(lambda a, b: [flip_map(a, b)[..., None]], _total)

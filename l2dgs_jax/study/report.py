@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -41,15 +41,29 @@ def write(folder: Path, names: Sequence[str]) -> list[str]:
     return [JSON, MARKDOWN, PLOTS]
 
 
+def scene_names(scenes: Iterable[str]) -> dict[str, str]:
+    """Short names of scenes, by their paths: of the ends of these as much as tells them apart."""
+    parts = {scene: Path(scene).parts for scene in scenes}
+
+    def shared(scene: str, length: int) -> bool:
+        return sum(other[-length:] == parts[scene][-length:] for other in parts.values()) > 1
+
+    lengths = {s: next((n for n in range(1, len(own)) if not shared(s, n)), len(own)) for s, own in parts.items()}
+    return {scene: "/".join(parts[scene][-length:]) for scene, length in lengths.items()}
+
+
 def markdown(members: Sequence[dict[str, Any]]) -> str:
     """A table with a row for each member: what was varied, how it ended, and the scores that it has."""
+    names = scene_names(member["scene"] for member in members)
+    variant = ["variant"] if any(member["variant"] for member in members) else []
     varied = list(dict.fromkeys(name for member in members for name in member["varied"]))
     shown = [name for name, path in _SCORES.items() if any(_score(member, path) is not None for member in members)]
-    header = ["scene", *varied, "ended", "Gaussians", *shown]
+    header = ["scene", *variant, *varied, "ended", "Gaussians", *shown]
     lines = [header, ["---"] * len(header)]
     for member in members:
         scores = [_score(member, _SCORES[name]) for name in shown]
-        cells = [Path(member["scene"]).name, *(_text(member["varied"].get(name)) for name in varied)]
+        cells = [names[member["scene"]], *(member[key] for key in variant)]
+        cells += [*(_text(member["varied"].get(name)) for name in varied)]
         cells += [member["ended"], str(member["scores"]["gaussians"])]
         lines.append(cells + ["" if score is None else f"{score:.3f}" for score in scores])
     return "".join(f"| {' | '.join(cells)} |\n" for cells in lines)

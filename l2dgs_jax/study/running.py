@@ -94,7 +94,9 @@ def _check_folder(output: Path, described: list[dict], resume: bool) -> None:
         except (OSError, ValueError):
             raise UserError(f"{output}: holds no study to resume; expected a folder that sweep wrote") from None
         if held != described:
-            raise UserError(f"{output}: holds a study of other members or settings; expected the same file again")
+            raise UserError(
+                f"{output}: holds a study of other members or settings; expected the same command, or a new folder"
+            )
     elif is_taken(output) and not (output.is_dir() and [path.name for path in output.iterdir()] == [LOCK]):
         raise UserError(f"{output}: already holds a study or files; expected a new folder, or --resume")
 

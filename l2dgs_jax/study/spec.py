@@ -69,6 +69,8 @@ def read(path: Path, scenes: Sequence[str] = ()) -> Spec:
     settings = _settings(path, "settings", content.get("settings", {}))
     grid = _grid(path, content.get("grid", {}))
     variants = _variants(path, content.get("variants", [{}]))
+    _check_different(path, scenes)
+    _check_disjoint(path, grid, variants)
 
     plans: list[Plan] = []
     for scene, seed, point, (label, own_preset, variant) in itertools.product(scenes, seeds, grid, variants):
@@ -110,6 +112,21 @@ def _scene(path: Path, scene: str) -> str:
     return scene if scene == "demo" else str((path.parent / Path(scene).expanduser()).absolute())
 
 
+def _check_different(path: Path, scenes: Sequence[str]) -> None:
+    folders = [scene if scene == "demo" else str(Path(scene).resolve()) for scene in scenes]
+    for index, (scene, folder) in enumerate(zip(scenes, folders, strict=True)):
+        if folder in folders[:index]:
+            raise UserError(f"{path}: the scene {scene} is named twice; expected different folders")
+
+
+def _check_disjoint(
+    path: Path, grid: Sequence[dict[str, Any]], variants: Sequence[tuple[str, str | None, dict[str, Any]]]
+) -> None:
+    for label, _, variant in variants:
+        for name in variant.keys() & grid[0].keys():
+            raise UserError(f"{path}: the variant '{label}' sets {name}, which [grid] varies; expected one of the two")
+
+
 def _flat(table: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     """Nested tables flattened to dotted names."""
     flat: dict[str, Any] = {}
@@ -141,7 +158,10 @@ def _grid(path: Path, table: Any) -> list[dict[str, Any]]:
     for name, values in _flat(table).items():
         if not isinstance(values, list) or not values:
             raise UserError(f"{path}: [grid] {name} is {values!r}; expected a list of values, at least one")
-        columns.append([(name, _checked(path, "grid", name, value)) for value in values])
+        checked = [_checked(path, "grid", name, value) for value in values]
+        if any(value in checked[:index] for index, value in enumerate(checked)):
+            raise UserError(f"{path}: [grid] {name} is {values!r}; expected different values")
+        columns.append([(name, value) for value in checked])
     return [dict(point) for point in itertools.product(*columns)]
 
 

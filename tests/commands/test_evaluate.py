@@ -168,6 +168,7 @@ def test_lpips_of_a_region_in_the_papers_convention_is_proportional_to_its_area(
     frames = {region: scores["lpips_alex_gain"] for region, scores in found["welllit"].items()}
     assert frames["overall"] > 0
     np.testing.assert_allclose(frames["static"] / frames["overall"], found["welllit"]["static"]["area"], rtol=0.05)
+    np.testing.assert_allclose(frames["dynamic"] + frames["static"], frames["overall"])
     assert f"LPIPS (AlexNet) {frames['overall']:.3f}" in table(found)
     assert "LPIPS needs weights" not in table(found)
 

@@ -7,15 +7,18 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import browser
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from experiments import comparison
 from experiments.comparison import _url
 from experiments.web_page import write_page
+from l2dgs_jax import runs
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.study import report
-from l2dgs_jax.types import Camera
+from l2dgs_jax.types import Camera, Decomposition, RenderOutput
 
 TEMPLATE = Path(comparison.__file__).with_suffix(".html")
 
@@ -36,15 +39,26 @@ def study(tmp_path):
 
 def test_every_member_of_the_first_seed_has_its_own_pictures(study, monkeypatch):
     flat = lambda grey: np.full((3, 6, 8, 3), grey, np.float32)
-    cameras = Camera(np.zeros((3, 4, 4)), np.zeros((3, 3, 3)), np.array([0.5, 0.0, 1.0]))
-    split = SimpleNamespace(cameras=cameras, images=flat(0.1), welllit=flat(0.9))
+
+    def split(focal):
+        cameras = Camera(np.zeros((3, 4, 4)), np.full((3, 3, 3), focal), np.array([0.5, 0.0, 1.0]))
+        return SimpleNamespace(names=names.get(focal, "abc"), cameras=cameras, images=flat(0.1), welllit=flat(0.9))
 
     def views(run, cameras):
-        for picture in flat(run.grey)[: len(cameras.time)]:
-            yield SimpleNamespace(images=SimpleNamespace(welllit=picture))
+        """As bright as the run, and as deep as the focal length of its own cameras."""
+        assert (run.number == cameras.K).all()
+        for picture in flat(0.2 + 0.1 * run.number)[: len(cameras.time)]:
+            ones, none = np.ones((6, 8), np.float32), np.zeros(0)
+            images = Decomposition(*[picture] * 4, np.ones((6, 8, 2), np.float32))
+            counters = none, np.zeros((), int), np.zeros((), bool)
+            yield RenderOutput(*jax.tree.map(jnp.asarray, (images, ones, picture[..., 0], *counters)))
 
+    def opened(path):
+        number = int(path.name)
+        return SimpleNamespace(number=number, dataset=SimpleNamespace(test=split(number)))
+
+    names = {}
     monkeypatch.setattr(comparison, "views", views)
-    opened = lambda path: SimpleNamespace(grey=0.2 + 0.1 * int(path.name), dataset=SimpleNamespace(test=split))
     monkeypatch.setattr(comparison, "open_run", opened)
     members = [
         member("00"),
@@ -54,6 +68,9 @@ def test_every_member_of_the_first_seed_has_its_own_pictures(study, monkeypatch)
         member("04", seed=1),
     ]
     folder = study(*members)
+    (folder / "02").mkdir()
+    lines = [{"step": 1, "psnr": 20.0}, {"step": 2, "psnr": 30.0}, {"step": 3, "psnr": float("nan")}]
+    (folder / "02" / runs.METRICS).write_text("".join(json.dumps(line) + "\n" for line in lines))
     comparison.main([str(folder), str(folder / "page.html"), "--views", "2"])
     data = re.search(r'<script type="application/json" id="data">(.*?)</script>', (folder / "page.html").read_text())
     (scene,) = json.loads(data[1])
@@ -61,6 +78,12 @@ def test_every_member_of_the_first_seed_has_its_own_pictures(study, monkeypatch)
     assert list(scene["pictures"]) == ["input", *ours, "truth"]
     assert len({tuple(pictures) for pictures in scene["pictures"].values()}) == len(scene["pictures"])
     assert (scene["times"], scene["size"]) == ([0.0, 1.0], [8, 6])
+    assert list(scene["depths"]) == ours
+    assert scene["curves"]["b"] == [[1.0, 20.0], [2.0, 30.0]]
+    assert scene["curves"][ours[0]] == []
+    names[2] = "abd"
+    with pytest.raises(UserError, match="02: has other held-out views"):
+        comparison.main([str(folder), str(folder / "page.html")])
 
 
 @pytest.mark.parametrize("name", ["input", "truth"])
@@ -101,15 +124,18 @@ def test_an_output_that_cannot_be_written_is_refused_before_rendering(study, out
 def test_time_curtain_and_enlargement_follow_the_controls(tmp_path):
     flat = lambda grey: _url(np.full((30, 40, 3), grey, np.uint8))
     pictures = {name: [flat(20 * k), flat(20 * k + 9)] for k, name in enumerate(("input", "a", "b", "truth"))}
-    scenes = [
-        {"name": name, "size": (40, 30), "times": [0.0, 0.5], "pictures": pictures} for name in ("x", "</script>")
-    ]
+    depths = {name: [flat(100 + 20 * k), flat(109 + 20 * k)] for k, name in enumerate("ab")}
+    curves = {"a": [[1.0, 20.0], [10.0, 30.0]], "b": []}
+    shown = {"size": (40, 30), "times": [0.0, 0.5], "pictures": pictures, "depths": depths, "curves": curves}
+    scenes = [shown | {"name": name} for name in ("x", "</script>")]
     write_page(tmp_path / "page.html", TEMPLATE, scenes)
     script = """
     const section = document.querySelectorAll("section")[1];
     const look = () => ({
       clock: section.querySelector("output").textContent,
       whole: [...section.querySelectorAll(".whole img")].map(image => image.src),
+      depths: [...section.querySelectorAll(".depths img")].map(image => image.src),
+      lines: [...section.querySelectorAll(".plot path")].map(line => line.getAttribute("d")),
       left: section.querySelector(".over").src, right: section.querySelector(".curtain img:not(.over)").src,
       edge: section.querySelector(".curtain").style.getPropertyValue("--at"),
       crop: section.querySelector(".crop").style.backgroundPosition,
@@ -142,6 +168,9 @@ def test_time_curtain_and_enlargement_follow_the_controls(tmp_path):
         second[0],
         second[2],
     )
+    assert before["depths"] == [urls[0] for urls in depths.values()]
+    assert after["depths"] == [urls[1] for urls in depths.values()]
+    assert before["lines"] == ["M10 39L100 1", ""]
     assert (before["edge"], after["edge"]) == ("50%", "20%")
     assert before["crop"] == "50% 50%"
     crop = [float(part.strip("%")) for part in after["crop"].split()]

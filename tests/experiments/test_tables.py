@@ -91,21 +91,61 @@ def rows_of(text):
 def test_table_1_has_each_scene_beside_the_figures_of_the_paper():
     mochi, mine = table1.markdown(tables.collect(MEMBERS, tables.welllit)).split("## ")[1:]
     rows = rows_of(mochi.partition("\n\n")[2])
-    assert rows["L2DGS"] == ["1.0", "0.50", "–", "2.0", "0.50", "–", "3.0", "0.50", "–"]
+    flat = "0.50 ± 0.00"
+    assert rows["L2DGS"] == ["1.0 ± 1.0", flat, "–", "2.0 ± 1.0", flat, "–", "3.0 ± 1.0", flat, "–"]
     assert rows["paper: L2DGS"] == ["21.0", "0.78", "0.07", "16.1", "0.77", "0.09", "17.6", "0.77", "0.16"]
     assert "paper" not in mine
-    assert rows_of(mine.partition("\n\n")[2])["without_ssim"] == ["12.0", "0.50", "13.0", "0.50", "14.0", "0.50"]
+    assert rows_of(mine.partition("\n\n")[2])["without_ssim"] == [
+        "12.0 ± 1.0",
+        flat,
+        "13.0 ± 1.0",
+        flat,
+        "14.0 ± 1.0",
+        flat,
+    ]
 
 
 def test_table_3_is_a_mean_over_scenes():
     rows = rows_of(table3.markdown(tables.over_scenes(tables.collect(MEMBERS, tables.welllit))))
-    assert rows["without_ssim"][:3] == ["7.0 (14.1)", "0.50 (0.41)", "– (0.20)"]
+    assert rows["without_ssim"][:3] == ["7.0 ± 1.0 (14.1)", "0.50 ± 0.00 (0.41)", "– (0.20)"]
+
+
+def test_a_row_that_lacks_a_scene_of_others_has_no_mean():
+    """Having diverged on the hard scene, it would look better than what finished there."""
+    lost = [one for one in MEMBERS if one["name"].startswith("mochi-L2DGS")]
+    ended = [one | {"ended": "diverged at step 7"} if one in lost else one for one in MEMBERS]
+    means = tables.over_scenes(tables.collect(ended, tables.welllit))
+    assert means["L2DGS"] == {}
+    assert means["without_ssim"]["dynamic"]["psnr"] == [6.0, 8.0]
+    unequal = [one for one in MEMBERS if one is not lost[0]]
+    assert tables.over_scenes(tables.collect(unequal, tables.welllit))["L2DGS"]["dynamic"]["psnr"] == [6.5]
+
+
+def test_scenes_of_one_name_are_kept_apart():
+    members = [member("a/toys", "x", 0, 10.0), member("b/toys", "x", 0, 30.0)]
+    found = tables.collect(members, tables.welllit)
+    assert {scene: rows["x"]["dynamic"]["psnr"] for scene, rows in found.items()} == {
+        "a/toys": [10.0],
+        "b/toys": [30.0],
+    }
+
+
+def test_the_share_of_pixels_stands_beside_the_scores_of_a_region():
+    cells = {"dynamic": {"psnr": [20.0], "area": [0.25]}, "overall": {"psnr": [21.0], "area": [1.0]}}
+    text = tables.table([("ours", [cells]), ("paper: ours", [{"dynamic": {"psnr": 19.0}}])])
+    assert list(rows_of(text).values()) == [
+        ["dynamic PSNR", "dynamic share of pixels", "overall PSNR", "overall share of pixels"],
+        ["---"] * 4,
+        ["20.0", "25%", "21.0", "100%"],
+        ["19.0", "", "–", ""],
+    ]
 
 
 def test_low_light_ends_in_a_mean():
     rows = rows_of(lowlight.markdown(tables.collect(MEMBERS, lowlight.lowlight)))
-    assert rows["mochi: L2DGS"] == ["1.0", "0.50", "2.0", "0.50", "3.0", "0.50"]
-    assert (rows["mean: L2DGS"][-2:], rows["mean: without_ssim"][-2:]) == (["8.0", "0.50"], ["9.0", "0.50"])
+    flat = "0.50 ± 0.00"
+    assert rows["mochi: L2DGS"] == ["1.0 ± 1.0", flat, "2.0 ± 1.0", flat, "3.0 ± 1.0", flat]
+    assert (rows["mean: L2DGS"][-2:], rows["mean: without_ssim"][-2:]) == (["8.0 ± 1.0", flat], ["9.0 ± 1.0", flat])
     assert rows["paper: L2DGS"][-2:] == ["31.9", "0.94"]
 
 
@@ -120,9 +160,9 @@ def test_points_of_a_grid_have_separate_rows():
     plain = member("mochi", "b", 0, 3.0, level=3.0)
     rows = tables.collect([*grid, plain], tables.welllit)["mochi"]
     assert {name: cells["dynamic"]["psnr"] for name, cells in rows.items()} == {
-        "a, level 1.0": 1.0,
-        "a, level 2.0": 2.0,
-        "b": 3.0,
+        "a, level 1.0": [1.0, 1.0],
+        "a, level 2.0": [2.0, 2.0],
+        "b": [3.0],
     }
     nameless = [one | {"variant": ""} for one in grid]
     assert set(labels(nameless).values()) == {"level 1.0", "level 2.0"}
@@ -132,11 +172,12 @@ def test_points_of_a_grid_have_separate_rows():
 def test_diverged_members_are_in_no_mean_and_are_named(tmp_path, capsys):
     diverged = [member("mochi", name, 1, 99.0, ended="diverged at step 7") for name in ("L2DGS", "without_exposure")]
     found = tables.collect([*MEMBERS, *diverged], tables.welllit)["mochi"]
-    assert found["L2DGS"]["dynamic"]["psnr"] == 1.0
+    assert found["L2DGS"]["dynamic"]["psnr"] == [0.0, 2.0]
     assert rows_of(tables.table([(name, [cells]) for name, cells in found.items()]))["without_exposure"] == ["–"] * 6
     tables.write(tables.Options(tmp_path), "t", [*MEMBERS, *diverged], {}, "the table\n")
-    *_, convention, _, named = (tmp_path / "t.md").read_text().splitlines()
+    *_, convention, _, named, _, seeds = (tmp_path / "t.md").read_text().splitlines()
     assert "nsff" in convention
+    assert seeds == "Means over 3 seeds, ± half of the range."
     assert named.endswith(": mochi-L2DGS-1 (diverged at step 7), mochi-without_exposure-1 (diverged at step 7).")
     assert len(json.loads((tmp_path / "t.json").read_text())["left_out"]) == 2
 

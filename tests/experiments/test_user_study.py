@@ -68,6 +68,8 @@ def test_the_table_has_the_form_of_table_2(tmp_path):
         ({"study": "other-1"}, "other-1"),
         ({"answers": [answer("Scene 3", 0, "A")]}, "does not offer"),
         ({"answers": [answer("Scene 1", 5, "A")]}, "does not offer"),
+        ({"answers": [answer("Scene 1", -1, "A")]}, "does not offer"),
+        ({"answers": [answer("Scene 1", 0, "A"), answer("Scene 1", 0, "A")]}, "does not offer"),
         ({"answers": [answer("Scene 1", 0, "C")]}, "does not offer"),
         ({"answers": [answer("Scene 1", 0, A=6)]}, "does not offer"),
         ({"answers": [answer("Scene 1", 0, A=2.5)]}, "does not offer"),

@@ -159,6 +159,20 @@ def test_the_conventions_differ_in_how_a_region_is_measured():
         assert (scores["overall"]["area"], scores["dynamic"]["area"]) == (1, mask.mean())
 
 
+def test_regions_add_up_to_the_whole_in_the_papers_convention():
+    """Also over frames of which some do not show a region, as in the paper's Table 1."""
+    (a, b), mask = pair(8, 12, 16), np.arange(16) < np.full((12, 1), 5)
+    for masks in ((mask, np.zeros_like(mask)), (mask, np.ones_like(mask))):
+        frames = [
+            metrics.compare(a + shift, b, one, measures={"psnr": PSNR, "coarse": COARSE}, convention="paper")
+            for shift, one in zip((0.0, 0.3), masks, strict=True)
+        ]
+        found = metrics.summarise(frames)
+        parts = found["dynamic"]["coarse"] + found["static"]["coarse"]
+        assert parts == pytest.approx(found["overall"]["coarse"])
+        assert found["dynamic"]["area"] == np.mean([one.mean() for one in masks if one.any()])
+
+
 def test_masked_ssim_is_that_of_dycheck_in_every_region():
     (a, b), mask = pair(9, 21, 26), random_mask(10, 21, 26)
     expected = SSIM.masked(a, b, mask)

@@ -220,4 +220,17 @@ def test_invalid_pixels_change_no_score():
         np.testing.assert_allclose(
             scores[region]["ssim"], partial_ssim_by_windows(prediction, replaced, mask), atol=1e-12
         )
-    assert metrics.compare(prediction, truth, moving, np.zeros_like(valid), covisible) == {}
+    for convention in ("nsff", "paper"):
+        nothing = metrics.compare(prediction, truth, moving, np.zeros_like(valid), covisible, convention=convention)
+        assert nothing == {}
+
+
+def test_regions_of_a_partly_valid_frame_average_windows_of_valid_pixels():
+    """If pixels that do not count were set equal instead, windows beside them would score too high."""
+    prediction, truth = pair(3, 30, 40, 3)
+    moving = np.random.default_rng(4).random((30, 40)) < 0.5
+    valid = np.ones((30, 40), bool)
+    valid[:, 15:] = False
+    found = metrics.compare(prediction, truth, moving, valid)
+    alone = metrics.compare(prediction[:, :15], truth[:, :15], moving[:, :15])
+    assert found["dynamic"]["ssim"] == pytest.approx(alone["dynamic"]["ssim"], abs=0.02)

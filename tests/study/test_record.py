@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from experiments.quality import table
+from l2dgs_jax.errors import UserError
 from l2dgs_jax.study import spec
 
 ROOT = Path(__file__).parents[2]
@@ -62,6 +63,39 @@ def test_a_seed_that_diverged_is_named_and_not_counted(tmp_path, capsys):
     assert "toys-1 (diverged at step 7)" in named
     assert "toys-2 (diverged at step 7)" in named
     assert "toys-0" not in named
+
+
+def test_the_same_scores_twice_are_refused_as_further_seeds(tmp_path):
+    """They may be of the same runs, or of other settings that the studies do not vary."""
+    for name in ("first", "second"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "results.json").write_text(json.dumps({"members": [member("toys", 0, {}, 36.0)]}))
+    (tmp_path / "kept.json").write_text('[{"settings": {}, "scenes": {"toys": {"low": [36.0]}}}]')
+    for pair in (("first", "second"), ("first", "kept.json"), ("kept.json", "first"), ("kept.json", "kept.json")):
+        with pytest.raises(UserError, match=f"{pair[1]}: has scores of the preset on toys"):
+            table.collect([tmp_path / name for name in pair])
+
+
+def test_scenes_of_one_name_are_no_seeds_of_one_scene(tmp_path):
+    members = [member("a/toys", 0, {}, 10.0), member("b/toys", 0, {}, 30.0)]
+    (tmp_path / "results.json").write_text(json.dumps({"members": members}))
+    assert table.collect([tmp_path]) == {(): {"a/toys": {"low": [10.0]}, "b/toys": {"low": [30.0]}}}
+
+
+def test_an_infinite_score_is_written_as_json(tmp_path):
+    (tmp_path / "results.json").write_text(json.dumps({"members": [member("toys", 0, {}, "Infinity")]}))
+    table.main([str(tmp_path), "--json", str(tmp_path / "kept.json")])
+    strict = json.loads((tmp_path / "kept.json").read_text(), parse_constant=pytest.fail)
+    assert strict[0]["scenes"]["toys"]["low"] == ["Infinity"]
+
+
+@pytest.mark.parametrize("content", ["[", "[1]", "[{}]", '[{"settings": {}, "scenes": ["none.json", 0]}]', '{"a": 1}'])
+def test_files_that_are_no_record_are_refused(tmp_path, content):
+    (tmp_path / "kept.json").write_text(content)
+    with pytest.raises(UserError, match=r"(kept|none)\.json: cannot be read"):
+        table.collect([tmp_path / "kept.json"])
+    with pytest.raises(UserError, match=r"results\.json: no such file"):
+        table.collect([tmp_path])
 
 
 def test_a_brief_table_has_all_scenes_side_by_side():

@@ -98,6 +98,12 @@ def test_scenes_alone_are_a_study(study):
         ('scenes = ["a"]\n[settings]\ncoarse_steps = 0\nfine_steps = 0', "--coarse-steps"),
         ('scenes = ["a"]\n[grid]\nloss.ssim = 1.0', "loss.ssim"),
         ('scenes = ["a"]\n[grid]\nloss.ssim = []', "loss.ssim"),
+        ('scenes = ["a"]\n[grid]\nloss.ssim = [1.0, 1]', "different values"),
+        ('scenes = ["a", "b/../a"]', "named twice"),
+        (
+            'scenes = ["a"]\n[grid]\nloss.ssim = [0.5, 1.0]\n[[variants]]\nname = "x"\nloss.ssim = 2.0',
+            "'x' sets loss.ssim",
+        ),
         ('scenes = ["a"]\n[grid]\nloss.ssim = [1.0, "x"]', "loss.ssim"),
         ('scenes = ["a"]\n[[variants]]\nloss.ssim = 1.0', "name"),
         ('scenes = ["a"]\n[[variants]]\nname = "a/b"', "name"),
@@ -230,8 +236,14 @@ def test_the_table_shows_what_was_varied_and_scored(tmp_path):
     scores = {"gaussians": 7, "lowlight": {"psnr": 30.12345, "ssim": 0.9}}
     perfect = {"gaussians": 7, "lowlight": {"psnr": "Infinity", "ssim": 1.0}}
     results = [
-        {"scene": "/s/a", "varied": {"seed": 0, "loss.ssim": 0.5}, "ended": "finished", "scores": scores},
-        {"scene": "/s/b", "varied": {"seed": 0}, "ended": "diverged at step 3", "scores": perfect},
+        {
+            "scene": "/s/a",
+            "variant": "",
+            "varied": {"seed": 0, "loss.ssim": 0.5},
+            "ended": "finished",
+            "scores": scores,
+        },
+        {"scene": "/s/b", "variant": "", "varied": {"seed": 0}, "ended": "diverged at step 3", "scores": perfect},
     ]
     for name, result in zip("xy", results, strict=True):
         (tmp_path / name).mkdir()
@@ -247,6 +259,16 @@ def test_the_table_shows_what_was_varied_and_scored(tmp_path):
         "| b | 0 |  | diverged at step 3 | 7 | inf | 1.000 |",
     ]
     assert (tmp_path / report.PLOTS).stat().st_size > 1000
+    named = [result | {"variant": name, "scene": f"/{name}/a"} for name, result in zip("xy", results, strict=True)]
+    assert [line.split(" | ")[:2] for line in report.markdown(named).splitlines()[2:]] == [
+        ["| x/a", "x"],
+        ["| y/a", "y"],
+    ]
+
+
+def test_scenes_are_called_by_as_much_of_their_paths_as_tells_them_apart():
+    names = report.scene_names(["demo", "/data/toys", "/a/one/left", "/b/one/left", "/a/two/left", "/c/demo"])
+    assert list(names.values()) == ["demo", "toys", "a/one/left", "b/one/left", "two/left", "c/demo"]
 
 
 def test_a_study_that_cannot_start_leaves_no_folder(study, tmp_path):
