@@ -100,7 +100,7 @@ def _train(options: Train) -> None:
         if options.resume and first:
             stack.enter_context(locked(folder))
         with memory_errors(lambda: "before the first step", LESS_MEMORY):
-            dataset = load_dataset(options.scene, config.downscale, config.format, config.held_out, config.frame_memory)
+            dataset = load_dataset(options.scene, **config.reading)
             dataset = enhanced(dataset, config.enhance, int(config.seed))
             config = resolve(config, dataset)
             # A training that cannot start should leave no folder behind.

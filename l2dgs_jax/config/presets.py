@@ -12,6 +12,7 @@ from l2dgs_jax.config.settings import Config, DensityConfig, LossConfig, ModelCo
 
 def _presets() -> dict[str, Config]:
     paper = Config(
+        normalise=False,
         model=ModelConfig(
             illumination_offset=0.0,
             reflectance_init="normal",
@@ -126,6 +127,7 @@ def _presets() -> dict[str, Config]:
     )
     # 4DGS (arXiv 2310.08528): its model, objective, learning rates and decay; steps and densification of `default`.
     four_d = Config(
+        normalise=False,
         coarse_steps=default.coarse_steps,
         fine_steps=default.fine_steps,
         model=ModelConfig(

@@ -287,6 +287,7 @@ class Config:
     # views not trained on: "auto" (the scene's own, or else the layout's rule), "4dgs", or a number k for every k-th
     # frame (docs/data.md)
     held_out: str = "auto"
+    normalise: bool = True  # whether a Nerfies scene is centred and scaled as its scene.json says; 4DGS does not do so
     sh_warmup: int | None = 1000  # steps after which one more SH band is used; None: all are used after half of the run
     drop: Number = 0.0  # share of the Gaussians that a step leaves out at random; grows from 0 to this over the run
     checkpoint_every: int = 500  # steps between checkpoints
@@ -305,6 +306,12 @@ class Config:
     def steps(self) -> int:
         """Length of the whole run."""
         return self.coarse_steps + self.fine_steps
+
+    @property
+    def reading(self) -> dict[str, Any]:
+        """How a scene is read: arguments of `load_dataset`."""
+        names = ("downscale", "format", "held_out", "frame_memory", "normalise")
+        return {name: getattr(self, name) for name in names}
 
     def stage_of(self, step: int) -> str:
         """The stage that a step belongs to; steps are numbered from 1."""

@@ -24,6 +24,7 @@ def load_dataset(
     format: str = "auto",
     held_out: str = "auto",
     frame_memory: float = Config.frame_memory,
+    normalise: bool = True,
 ) -> Dataset:
     """Read a scene in any of the known layouts.
 
@@ -33,6 +34,7 @@ def load_dataset(
         format: a name in `LAYOUTS`, or "auto" to recognise the layout of the folder.
         held_out: which frames are not trained on, see `splits.hold_out`.
         frame_memory: GiB of memory for its frames; if they take more, they go to temporary files (`MappedArray`).
+        normalise: whether the world is centred and scaled as the `scene.json` of the layout "nerfies" says.
 
     Raises:
         UserError: anything in the scene is missing, malformed or inconsistent.
@@ -43,7 +45,7 @@ def load_dataset(
         raise UserError(f"--frame-memory {frame_memory}: expected GiB, from 0")
     splits.check_rule(held_out)
     name = "demo" if scene == "demo" else str(Path(scene).absolute())
-    source = Source(name, downscale, format, held_out, float(frame_memory))
+    source = Source(name, downscale, format, held_out, float(frame_memory), normalise)
     folder = demo.FOLDER if scene == "demo" else Path(scene)
     if format not in ("auto", *LAYOUTS):
         raise UserError(f"--format {format}: no such layout; expected auto, {', '.join(LAYOUTS)}")
@@ -55,7 +57,8 @@ def load_dataset(
         if format == "auto":
             format = _recognized(folder)
         with np.errstate(all="ignore"):  # `assemble` rejects values that have overflowed
-            dataset = LAYOUTS[format].read(folder, downscale, held_out, frame_memory)
+            options = {"normalise": normalise} if format == "nerfies" else {}
+            dataset = LAYOUTS[format].read(folder, downscale, held_out, frame_memory, **options)
     except OSError as error:
         raise UserError(f"{error.filename or folder}: {error.strerror}; expected files that can be read") from None
     return dataclasses.replace(dataset, source=source)

@@ -22,6 +22,7 @@ class Source(NamedTuple):
         format: see `load_dataset`.
         held_out: see `load_dataset`.
         frame_memory: see `load_dataset`.
+        normalise: see `load_dataset`.
         enhance: how the training frames were brightened after loading (preprocess/enhancement.py).
     """
 
@@ -30,6 +31,7 @@ class Source(NamedTuple):
     format: str
     held_out: str
     frame_memory: float
+    normalise: bool = True
     enhance: str = "none"
 
     @property

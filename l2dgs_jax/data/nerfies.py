@@ -15,6 +15,7 @@ from jaxtyping import Float32, Float64
 
 from l2dgs_jax.data import splits
 from l2dgs_jax.data.assembly import Frame, assemble
+from l2dgs_jax.data.clouds import read_ply
 from l2dgs_jax.data.dataset import Dataset
 from l2dgs_jax.data.lens import Lens
 from l2dgs_jax.data.parsing import numbers, read_array, read_json, rotation
@@ -23,20 +24,23 @@ from l2dgs_jax.data.writing import write_lists, write_pictures
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.runtime.files import new_folder, write_json
 
+DENSE_CLOUD = "points3D_downsample2.ply"  # as the scripts of 4DGaussians call it
+
 
 def recognizes(folder: Path) -> bool:
     """Whether the folder has this layout."""
     return (folder / "camera").is_dir()
 
 
-def read(folder: Path, downscale: int, held_out: str, frame_memory: float) -> Dataset:
-    """Read a scene. World coordinates are normalised as `scene.json` says: X' = (X - center) * scale.
+def read(folder: Path, downscale: int, held_out: str, frame_memory: float, normalise: bool = True) -> Dataset:
+    """Read a scene.
 
     Args:
         folder: of the scene.
         downscale: integer factor by which images are smaller than full size.
         held_out: see `splits.hold_out`.
         frame_memory: see `assemble`.
+        normalise: whether world coordinates X become (X - center) * scale, with center and scale from `scene.json`.
 
     Raises:
         UserError: a file is missing, malformed or inconsistent.
@@ -44,7 +48,7 @@ def read(folder: Path, downscale: int, held_out: str, frame_memory: float) -> Da
     listed, own = splits.lists(folder)
     train, val, notes = splits.hold_out(f"{folder / 'dataset.json'}", listed, own, held_out, default="4dgs")
     times = splits.instants(folder, listed)
-    center, scale = _normalization(folder)
+    center, scale = _normalization(folder) if normalise else (np.zeros(3), 1.0)
     points, colors = _points(folder)
 
     def frames(names: list[str]) -> list[Frame]:
@@ -71,7 +75,13 @@ def _normalization(folder: Path) -> tuple[Float64[np.ndarray, "3"], float]:
 
 
 def _points(folder: Path) -> tuple[Float64[np.ndarray, "P 3"], Float32[np.ndarray, "P 3"] | None]:
-    """Points as stored, and their colours from a file of their own or from columns 4 to 6."""
+    """Points as stored, and their colours from a file of their own or from columns 4 to 6.
+
+    The dense cloud of 4DGS (arXiv 2310.08528) is preferred if it has been made.
+    """
+    if (folder / DENSE_CLOUD).is_file():
+        points, colors = read_ply(folder / DENSE_CLOUD)
+        return points.astype(np.float64), colors
     path = folder / "points.npy"
     rows = read_array(path, "the scene's surface points, shape (P, 3)")
     if rows.ndim != 2 or rows.shape[1] not in (3, 6) or not len(rows):

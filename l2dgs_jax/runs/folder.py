@@ -118,7 +118,7 @@ def open_run(folder: str | Path, stage: Literal["final", "coarse"] = "final") ->
         raise UserError(f"{path}: no such checkpoint; expected a run that has got that far")
     if scene != "demo" and not Path(scene).exists():
         raise UserError(f"{folder / SETTINGS}: names the scene {scene}, which is not there; expected its new place")
-    dataset = load_dataset(scene, config.downscale, config.format, config.held_out, config.frame_memory)
+    dataset = load_dataset(scene, **config.reading)
     state = checkpoints.load_last(path, config, len(dataset.train.names)).state
     return Run(config, dataset, state, folder)
 

@@ -35,10 +35,9 @@ def load_groups(spec: Spec) -> list[list[Trial]]:
     groups: dict[tuple, list[Trial]] = {}
     for plan in spec.plans:
         c = plan.config
-        source = (plan.scene, c.downscale, c.format, c.held_out, c.frame_memory)
-        key = (*source, c.enhance, c.enhance != "none" and c.seed)
+        key = (plan.scene, *c.reading.values(), c.enhance, c.enhance != "none" and c.seed)
         if key not in datasets:
-            datasets[key] = enhanced(load_dataset(*source), c.enhance, int(c.seed))
+            datasets[key] = enhanced(load_dataset(plan.scene, **c.reading), c.enhance, int(c.seed))
         dataset = datasets[key]
         trial = Trial(plan, dataset, resolve(c, dataset))
         groups.setdefault((overrides.outline(trial.config), *_shapes(trial).values()), []).append(trial)

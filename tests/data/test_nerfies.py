@@ -7,7 +7,8 @@ import pytest
 from scenes import edit_json, write_image, write_json, write_nerfies
 
 from l2dgs_jax import data
-from l2dgs_jax.data import demo, images
+from l2dgs_jax.config import PRESETS
+from l2dgs_jax.data import clouds, demo, images, nerfies
 
 LENS = {
     "focal_length": 110.0,
@@ -51,6 +52,30 @@ def test_cameras_project_as_nerfies_does(tmp_path, downscale):
         for index, name in enumerate(split.names):
             expected = lens_projection(read_camera(scene, name), stored) / downscale
             np.testing.assert_allclose(pinhole_projection(split, index, dataset.points), expected, atol=1e-3)
+
+
+def test_the_world_can_stay_as_stored(tmp_path):
+    scene = write_nerfies(tmp_path, center=(0.5, -1.0, 2.0), scale=0.25)
+    stored = np.load(scene / "points.npy")
+    kept, moved = (data.load_dataset(scene, normalise=normalise) for normalise in (False, True))
+    np.testing.assert_allclose(kept.points, stored, rtol=1e-6)
+    np.testing.assert_allclose(moved.points, (stored - [0.5, -1.0, 2.0]) * 0.25, atol=1e-6)
+    np.testing.assert_allclose(
+        pinhole_projection(kept.train, 1, kept.points), pinhole_projection(moved.train, 1, moved.points), atol=1e-3
+    )
+    assert not PRESETS["paper"].normalise
+    assert PRESETS["default"].normalise
+
+
+def test_the_dense_cloud_of_4dgaussians_is_preferred(tmp_path):
+    scene = write_nerfies(tmp_path, center=(0.5, -1.0, 2.0), scale=0.25)
+    points, colors = np.random.default_rng(0).random((2, 60, 3)).astype(np.float32)
+    clouds.write_ply(scene / nerfies.DENSE_CLOUD, points, colors)
+    dataset = data.load_dataset(scene)
+    np.testing.assert_allclose(dataset.points, (points - [0.5, -1.0, 2.0]) * 0.25, atol=1e-6)
+    np.testing.assert_allclose(dataset.colors, colors, atol=1 / 255)
+    (scene / "points.npy").unlink()
+    assert len(data.load_dataset(scene).points) == 60
 
 
 def test_undistorted_dots_lie_where_the_pinhole_projects(tmp_path):
