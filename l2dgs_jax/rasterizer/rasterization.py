@@ -87,7 +87,7 @@ def rasterize(
         # Rounded up to three significant bits: wastes at most a quarter of the buffer, and few sizes are compiled.
         step = 1 << max(needed.bit_length() - 3, 8)
         pair_capacity = max(-(-needed // step), 1) * step
-    output = _rasterize(*arrays, **static, capacity=pair_capacity)
+    output = _rasterize(*arrays, **static, capacity=max(pair_capacity, 1))
     if depth_mode == "expected":
         output = output._replace(depth=output.depth / jnp.maximum(output.alpha, LEAST_ALPHA))
     return output if views else jax.tree.map(lambda x: x[0] if x.ndim else x, output)

@@ -32,6 +32,9 @@ def run(
         use_huge_pages()
     devices.use_atomic_additions()
     use_compilation_cache()
+    default = signal.getsignal(signal.SIGTERM) == signal.SIG_DFL  # which would leave behind what is half written
+    if default:
+        signal.signal(signal.SIGTERM, _terminate)
     try:
         with warnings.catch_warnings():
             warnings.showwarning = _show_warning  # type: ignore[assignment]
@@ -53,6 +56,14 @@ def run(
     except KeyboardInterrupt:
         print("stopped", file=sys.stderr)
         sys.exit(128 + signal.SIGINT)
+    finally:
+        if default:
+            signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+
+def _terminate(number: int, _: Any) -> None:
+    print("stopped", file=sys.stderr)
+    sys.exit(128 + number)
 
 
 def _show_warning(message: Warning | str, *_: Any) -> None:

@@ -22,18 +22,19 @@ def replacing(path: Path) -> Iterator[Path]:
     Raises:
         UserError: the folder is missing or not writable, or `path` is a folder.
     """
-    if not path.parent.is_dir():
-        raise UserError(f"{path}: cannot be written; expected an existing folder {path.parent}")
-    if path.is_dir():
-        raise UserError(f"{path}: is a folder; expected a file to write")
     temporary = path.with_name(f"{path.stem}.tmp{path.suffix}")
     try:
+        if not path.parent.is_dir():
+            raise UserError(f"{path}: cannot be written; expected an existing folder {path.parent}")
+        if path.is_dir():
+            raise UserError(f"{path}: is a folder; expected a file to write")
         yield temporary
         os.replace(temporary, path)
     except OSError as error:
         raise unwritable(path, error) from None
     finally:
-        temporary.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
 
 
 def reserve(descriptor: int, size: int) -> None:
@@ -84,7 +85,7 @@ def make_folder(path: Path) -> None:
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise UserError(f"{path}: cannot be made ({error.strerror}); expected a writable place") from None
+        raise unwritable(path, error) from None
 
 
 @contextlib.contextmanager
@@ -108,7 +109,7 @@ def new_folder(path: Path) -> Iterator[Path]:
                 target.rmdir()
             os.rename(filled, target)
     except OSError as error:
-        raise UserError(f"{path}: cannot be written ({error.strerror}); expected a writable place") from None
+        raise unwritable(path, error) from None
 
 
 def write_json(path: Path, content: Any) -> None:

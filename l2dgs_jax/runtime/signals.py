@@ -28,6 +28,8 @@ def stop_requests(notice: Callable[[], None]) -> Iterator[Callable[[], int | Non
         """Unlike a signal handler, this thread acts at once even while the main thread compiles."""
         while number := listening.recv(1):
             (signal_number,) = number
+            if signal_number not in STOP_SIGNALS:  # a handler of the program around this one
+                continue
             if received and signal_number == signal.SIGINT:
                 os._exit(128 + signal_number)
             if not received:

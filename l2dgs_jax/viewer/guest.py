@@ -72,7 +72,7 @@ class Guest:
         self._shown: Shown | None = None
         self._frusta: list[Any] = []
         first = int(np.argmin(dataset.train.cameras.time))
-        self._panel = Panel(client.gui, changed)
+        self._panel = Panel(client.gui, changed, renderers.run.config.model.decomposition == "retinex")
         self._panel.home.on_click(lambda _: self._go(first))
         self._panel.frusta.on_update(lambda _: self._show_frusta())
         client.camera.on_update(lambda _: self._moved())

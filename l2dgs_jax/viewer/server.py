@@ -51,7 +51,8 @@ def check(host: str, port: int, prefix: str = "") -> None:
         prefix: of the names of the options for these, for messages.
 
     Raises:
-        UserError: viser is not installed, the port is invalid, or listening at that address is not possible.
+        UserError: viser is not installed, the port is invalid, listening at that address is not possible, or neither
+            the port nor any above it is free.
     """
     extra("viser", "view", "viewing")
     if not 1 <= port <= 65535:
@@ -61,6 +62,16 @@ def check(host: str, port: int, prefix: str = "") -> None:
     except OSError as error:
         what = "an address of this machine, or 0.0.0.0"
         raise UserError(f"--{prefix}host {host}: {error.strerror}; expected {what}") from None
+    if not any(_is_free(host, candidate) for candidate in range(port, 65536)):
+        raise UserError(f"--{prefix}port {port}: is in use, and so are all above it; expected another port")
+
+
+def _is_free(host: str, port: int) -> bool:
+    try:
+        socket.create_server((host, port)).close()
+    except OSError:
+        return False
+    return True
 
 
 @contextlib.contextmanager

@@ -1,6 +1,7 @@
 """Videos that browsers play: H.264 in .mp4 with PyAV if it is installed, or else VP8 in .webm with OpenCV."""
 
 import contextlib
+import errno
 import os
 from collections.abc import Callable, Iterator
 from fractions import Fraction
@@ -96,7 +97,7 @@ def _vp8(path: Path, size: tuple[int, int], fps: float | int) -> Iterator[Add]:
     complete = sum(iter(written.grab, False)) == added
     written.release()
     if not complete:
-        raise OSError(0, "frames are missing, the disk may be full")  # OpenCV itself reports nothing
+        raise OSError(errno.ENOSPC, "frames are missing, the disk may be full")  # OpenCV itself reports nothing
 
 
 @contextlib.contextmanager

@@ -1,5 +1,7 @@
 """`l2dgs COMMAND` and `python -m l2dgs_jax.COMMAND`."""
 
+import contextlib
+import os
 import signal
 import subprocess
 import sys
@@ -9,6 +11,7 @@ import pytest
 
 from l2dgs_jax.__main__ import COMMANDS
 from l2dgs_jax.runtime import command_line
+from l2dgs_jax.runtime.files import replacing
 
 
 def run(*arguments):
@@ -58,6 +61,26 @@ def test_a_warning_is_printed_as_one_sentence(capsys):
 
     command_line.run(command, [])
     assert capsys.readouterr().err == "warning: it is slow\n"
+
+
+@pytest.mark.parametrize(("handler", "ends"), [(signal.SIG_DFL, True), (signal.SIG_IGN, False)])
+def test_a_command_that_is_terminated_removes_what_is_half_written(tmp_path, handler, ends):
+    def command(arguments):
+        with replacing(tmp_path / "file.txt") as temporary:
+            temporary.write_text("half")
+            os.kill(os.getpid(), signal.SIGTERM)
+            temporary.write_text("whole")
+
+    before = signal.signal(signal.SIGTERM, handler)
+    try:
+        with pytest.raises(SystemExit) if ends else contextlib.nullcontext() as stop:
+            command_line.run(command, [])
+        assert signal.getsignal(signal.SIGTERM) == handler
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    if ends:
+        assert stop.value.code == 128 + signal.SIGTERM
+    assert [path.read_text() for path in tmp_path.iterdir()] == ([] if ends else ["whole"])
 
 
 PRINTS = "print('x' * 100_000)"

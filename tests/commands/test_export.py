@@ -163,7 +163,7 @@ def test_cameras_and_the_model_are_exported(run_folder, tmp_path, capsys):
         (["--to", "cameras", "--fps", "0"], "--fps 0: expected a whole number from 1"),
         (["--to", "gltf", "--output", "x.ply"], "--output x.ply: expected a file name that ends in .glb"),
         (["--to", "ply", "--times", "2", "--output", "{full}"], "exists already; expected a new or an empty folder"),
-        (["--to", "ply", "--output", "{full}/note.txt/x.ply"], "expected a writable place"),
+        (["--to", "ply", "--output", "{full}/note.txt/x.ply"], "expected a writable folder"),
     ],
 )
 def test_invalid_input_gives_one_sentence_and_exit_2(run_folder, baked_times, tmp_path, capsys, arguments, message):

@@ -178,7 +178,7 @@ def camera_path(**changes):
     [
         (["{missing}"], "missing: not a training run; expected a folder with config.json"),
         (["{file}"], "file: not a training run; expected a folder with config.json"),
-        (["{run}", "--output", "{file}"], "expected a writable place"),
+        (["{run}", "--output", "{file}"], "expected a writable folder"),
         (["{run}", "--path", "spirale"], "--path spirale: no such file; expected one, or dataset, interpolate, spiral"),
         (["{run}", "--path", ""], "--path : no such file; expected one, or dataset"),
         (["{run}", "--path", "{file}"], "file: cannot be read as JSON"),

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from l2dgs_jax.errors import UserError
+from l2dgs_jax.errors import DISK_FULL, UserError
 from l2dgs_jax.runtime.files import append_line, new_folder, replacing, write_json
 
 
@@ -42,6 +42,11 @@ def test_a_file_that_cannot_be_written_is_reported_and_leaves_nothing_behind(tmp
     assert not list(tmp_path.iterdir())
 
 
+def test_a_name_that_is_too_long_is_reported_in_one_sentence(tmp_path):
+    with pytest.raises(UserError, match="cannot be written"), replacing(tmp_path / f"{'x' * 300}.txt"):
+        pass
+
+
 def test_a_folder_appears_whole_or_not_at_all(tmp_path):
     def fill(path, then=None):
         with new_folder(path) as temporary:
@@ -51,9 +56,10 @@ def test_a_folder_appears_whole_or_not_at_all(tmp_path):
                 raise then
 
     for error, raised in ((KeyError("x"), KeyError), (OSError(28, "No space left on device"), UserError)):
-        with pytest.raises(raised):
+        with pytest.raises(raised) as caught:
             fill(tmp_path / "new", error)
         assert not list(tmp_path.iterdir())
+    assert caught.value.code == DISK_FULL
     (tmp_path / "empty").mkdir()
     for name in ("new", "deep/er", "empty"):
         fill(tmp_path / name)

@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 
 import pytest
 
@@ -30,6 +31,19 @@ def test_a_signal_is_a_request_and_its_handler_is_restored(number):
         os.kill(os.getpid(), signal.SIGTERM)  # not taken for a second Ctrl-C, which ends the process
     assert signal.getsignal(number) == before
     assert signal.set_wakeup_fd(-1) == -1
+
+
+def test_a_signal_of_the_program_around_is_no_request():
+    before = signal.signal(signal.SIGUSR1, lambda *_: None)
+    try:
+        with stop_requests(lambda: None) as stopping:
+            os.kill(os.getpid(), signal.SIGUSR1)
+            os.kill(os.getpid(), signal.SIGTERM)
+            while stopping() is None:
+                time.sleep(0.001)
+            assert stopping() == signal.SIGTERM
+    finally:
+        signal.signal(signal.SIGUSR1, before)
 
 
 def test_an_ignored_signal_stays_ignored():

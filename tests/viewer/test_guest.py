@@ -8,7 +8,7 @@ import pytest
 from fake_browser import Client
 from scenes import write_nerfies
 
-from l2dgs_jax.config import Config
+from l2dgs_jax.config import PRESETS, Config
 from l2dgs_jax.data import load_dataset
 from l2dgs_jax.runs.pictures import Output
 from l2dgs_jax.types import Decomposition, RenderOutput
@@ -210,3 +210,10 @@ def test_filmed_frames_can_be_shown_hidden_and_flown_to(dataset, visit, renderer
     assert not visit.client.frusta
     visit.next_picture()
     assert visit.client.depth is None
+
+
+def test_what_acts_on_the_decomposition_is_disabled_without_one(dataset, renderers):
+    assert not any(control.disabled for control in Visit(dataset, renderers).gui.controls.values())
+    renderers.run.config = PRESETS["curve-4dgs"]
+    controls = Visit(dataset, renderers).gui.controls
+    assert {name for name, control in controls.items() if control.disabled} == {"Brightness", "Shading"}
