@@ -72,8 +72,8 @@ def project(
     visible, depth, normalised = _before_camera(tuple(means.T), viewmat, jnp.asarray(near_plane, means.dtype))
     centre, jacobian = _through_lens(depth, normalised, viewmat, K, size)
     halves = _half(jacobian, _rotation(*_unit(*quats.T)), tuple(scales.T))
-    covariance = _bounded(_covariance, eps2d=eps2d)(*halves)
-    conic = _bounded(_conic, eps2d=eps2d)(*covariance)
+    *covariance, area = _bounded(_covariance, eps2d=eps2d)(*halves)
+    conic = _bounded(_conic, eps2d=eps2d)(*covariance, area)
     return Projected(jnp.stack(centre).T, jnp.stack(covariance).T, jnp.stack(conic).T, depth, visible)
 
 
@@ -140,12 +140,13 @@ def _half(jacobian: tuple[Columns, ...], rotation: tuple[Columns, ...], scale: C
 
 
 def _covariance(u: Columns, v: Columns, *, eps2d: float) -> Columns:
+    """The covariance with blur, and its determinant without."""
     dot = lambda p, q: sum(a * b for a, b in zip(p, q, strict=True))
-    return dot(u, u) + eps2d, dot(u, v), dot(v, v) + eps2d
+    # Lagrange's identity; xx yy - xy^2 would cancel if the Gaussian is long and thin.
+    area = sum((u[j] * v[k] - u[k] * v[j]) ** 2 for j, k in ((0, 1), (1, 2), (2, 0)))
+    return dot(u, u) + eps2d, dot(u, v), dot(v, v) + eps2d, area
 
 
-def _conic(xx: Column, xy: Column, yy: Column, *, eps2d: float) -> Columns:
-    # The determinant without blur is at least 0 (Cauchy-Schwarz); the blur keeps the sum positive despite rounding.
-    determinant = (xx - eps2d) * (yy - eps2d) - xy * xy
-    determinant = jnp.maximum(determinant, 0) + eps2d * (xx + yy - eps2d)
+def _conic(xx: Column, xy: Column, yy: Column, area: Column, *, eps2d: float) -> Columns:
+    determinant = area + eps2d * (xx + yy - eps2d)
     return yy / determinant, -xy / determinant, xx / determinant

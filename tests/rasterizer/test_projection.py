@@ -68,6 +68,21 @@ def test_covariance_is_projected_by_the_linearised_pinhole_map(scene):
     np.testing.assert_allclose(conics @ expected, np.tile(np.eye(2), (4, 1, 1)), atol=1e-10)
 
 
+@pytest.mark.parametrize("length", [300.0, 3_000.0, 30_000.0])
+def test_long_thin_gaussians_keep_their_width_in_single_precision(length):
+    """A needle in front of the camera is `length` pixels long, and a third of a pixel wide without blur."""
+    half_turn = np.pi / 8  # half of 45 degrees about the line of sight
+    quats = np.array([[np.cos(half_turn), 0, 0, np.sin(half_turn)]])
+    arrays = ([[0.0, 0, 1]], quats, [[length / 1000, 3e-4, 3e-4]], np.eye(4), np.diag([1000.0, 1000, 1]))
+    conics = {
+        kind: np.asarray(view(*(jnp.asarray(x, kind) for x in arrays)).conics[0]) for kind in (jnp.float32, jnp.float64)
+    }
+    xx, xy, yy = conics[jnp.float64]
+    across = np.linalg.eigvalsh([[xx, xy], [xy, yy]])[-1]
+    assert across == pytest.approx(1 / (0.3**2 + 0.3), rel=1e-9)
+    np.testing.assert_allclose(conics[jnp.float32], conics[jnp.float64], rtol=length * 1e-6)
+
+
 def test_rotations_do_not_depend_on_the_norm_of_quaternions(scene):
     quats = scene[1]
     turned = jnp.moveaxis(rotations(quats), -1, 0)
