@@ -1,5 +1,7 @@
 """How far from the truth moving things start: `python -m experiments.quality.depth_accuracy SCENE... [--downscale K]`.
 
+With `--json FILE`, the numbers of all scenes are written as well.
+
 The scenes have well-lit frames, masks of what moves, and held-out views of the same instants from another place. Stereo
 between a training and a held-out frame tells how far away the seeds in the training frame are. Only those count that
 the masks show to lie on what moves. Printed are the median of the absolute error and the error's own median, for the
@@ -8,6 +10,7 @@ whole clip and for each sixth of it: a positive one means too far away.
 
 import argparse
 from collections.abc import Sequence
+from pathlib import Path
 
 import cv2
 import jax.numpy as jnp
@@ -24,6 +27,7 @@ from l2dgs_jax.errors import UserError
 from l2dgs_jax.model.deformation import path_weights
 from l2dgs_jax.model.initialisation import Seeds, path_knots
 from l2dgs_jax.runtime import command_line
+from l2dgs_jax.runtime.files import write_json
 from l2dgs_jax.training.seeds import find_seeds
 from l2dgs_jax.types import Camera
 
@@ -40,7 +44,9 @@ def main(arguments: Sequence[str]) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", nargs="+")
     parser.add_argument("--downscale", type=int, default=1)
+    parser.add_argument("--json", type=Path)
     options = parser.parse_args(arguments)
+    accuracies = {}
     for scene in options.scenes:
         seen, full = load_dataset(scene, options.downscale), load_dataset(scene)
         if full.train.welllit is None or full.test.welllit is None or seen.train.masks is None:
@@ -51,7 +57,24 @@ def main(arguments: Sequence[str]) -> None:
         if not found:
             raise UserError(f"{scene}: no held-out view shows the instant of a training frame; expected some that do")
         together = np.concatenate(found)
-        print(f"{seen.name}: {summary(together)}; by parts: {', '.join(map(summary, _parts(found)))}")
+        name = Path(scene).name
+        print(f"{name}: {summary(together)}; by parts: {', '.join(map(summary, _parts(found)))}")
+        accuracies[name] = {"whole clip": _median(together), "last sixth": _median(_parts(found)[-1])}
+    if options.json:
+        write_json(options.json, accuracies)
+
+
+def markdown(accuracies: dict[str, dict[str, float | None]]) -> str:
+    """A table of the medians of absolute errors, as --json writes them."""
+    columns = list(next(iter(accuracies.values())))
+    lines = [["", *columns], ["---"] * (len(columns) + 1)]
+    for scene, found in accuracies.items():
+        lines.append([scene, *("" if (x := found[name]) is None else f"{x:.1%}" for name in columns)])
+    return "".join(f"| {' | '.join(cells)} |\n" for cells in lines)
+
+
+def _median(errors: Float[np.ndarray, " N"]) -> float | None:
+    return round(float(np.median(np.abs(errors))), 5) if len(errors) else None
 
 
 def summary(errors: Float[np.ndarray, " N"]) -> str:
