@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import tyro
 
@@ -25,8 +26,8 @@ class Convert:
             (docs/data.md).
     """
 
-    scene: tyro.conf.Positional[str]
-    output: tyro.conf.Positional[Path]
+    scene: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SCENE")]
+    output: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="OUT")]
     to: LayoutName
     format: Layout = "auto"
     downscale: int = 1

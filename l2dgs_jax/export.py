@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import tyro
@@ -59,7 +59,7 @@ class Export:
         stage: the last checkpoint ("final"), or the one at the end of the coarse stage ("coarse").
     """
 
-    run: tyro.conf.Positional[Path]
+    run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
     to: Literal["ply", "splat", "gltf", "cloud", "html", "npz", "cameras"]
     output: Path | None = None
     time: float | None = None

@@ -25,8 +25,8 @@ class Prepare:
         capture: how the video becomes a scene.
     """
 
-    source: tyro.conf.Positional[Path]
-    output: tyro.conf.Positional[Path]
+    source: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SOURCE")]
+    output: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="OUT")]
     capture: Annotated[CaptureConfig, tyro.conf.arg(name="")] = dataclasses.field(default_factory=CaptureConfig)
 
 

@@ -35,8 +35,8 @@ class Simulate:
         darkening: how the frames are darkened.
     """
 
-    scene: tyro.conf.Positional[str]
-    output: tyro.conf.Positional[Path]
+    scene: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SCENE")]
+    output: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="OUT")]
     downscale: int = 1
     format: Layout = "auto"
     held_out: str = "auto"

@@ -29,8 +29,8 @@ class Sweep:
         hosts: training on several hosts.
     """
 
-    spec: tyro.conf.Positional[Path]
-    output: tyro.conf.Positional[Path]
+    spec: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="STUDY.toml")]
+    output: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="OUT")]
     resume: bool = False
     devices: int | None = None
     hosts: Annotated[Hosts, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Hosts)

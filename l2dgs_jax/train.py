@@ -63,7 +63,7 @@ class Train:
         hosts: training on several hosts.
     """
 
-    scene: tyro.conf.Positional[str]
+    scene: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SCENE")]
     preset: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
     output: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
     resume: _Flag = False

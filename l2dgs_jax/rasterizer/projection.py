@@ -72,8 +72,8 @@ def project(
     visible, depth, normalised = _before_camera(tuple(means.T), viewmat, jnp.asarray(near_plane, means.dtype))
     centre, jacobian = _through_lens(depth, normalised, viewmat, K, size)
     halves = _half(jacobian, _rotation(*_unit(*quats.T)), tuple(scales.T))
-    *covariance, area = _bounded(_covariance, eps2d=eps2d)(*halves)
-    conic = _bounded(_conic, eps2d=eps2d)(*covariance, area)
+    *covariance, sharp = _bounded(_covariance, eps2d=eps2d)(*halves)
+    conic = _bounded(_conic, eps2d=eps2d)(*covariance, sharp)
     return Projected(jnp.stack(centre).T, jnp.stack(covariance).T, jnp.stack(conic).T, depth, visible)
 
 
@@ -142,11 +142,13 @@ def _half(jacobian: tuple[Columns, ...], rotation: tuple[Columns, ...], scale: C
 def _covariance(u: Columns, v: Columns, *, eps2d: float) -> Columns:
     """The covariance with blur, and its determinant without."""
     dot = lambda p, q: sum(a * b for a, b in zip(p, q, strict=True))
-    # Lagrange's identity; xx yy - xy^2 would cancel if the Gaussian is long and thin.
-    area = sum((u[j] * v[k] - u[k] * v[j]) ** 2 for j, k in ((0, 1), (1, 2), (2, 0)))
-    return dot(u, u) + eps2d, dot(u, v), dot(v, v) + eps2d, area
+    cross = lambda j, k: u[j] * v[k] - u[k] * v[j]
+    # By Lagrange's identity; xx yy - xy^2 would cancel if the Gaussian is long and thin.
+    determinant = cross(0, 1) ** 2 + cross(1, 2) ** 2 + cross(2, 0) ** 2
+    return dot(u, u) + eps2d, dot(u, v), dot(v, v) + eps2d, determinant
 
 
-def _conic(xx: Column, xy: Column, yy: Column, area: Column, *, eps2d: float) -> Columns:
-    determinant = area + eps2d * (xx + yy - eps2d)
+def _conic(xx: Column, xy: Column, yy: Column, sharp: Column, *, eps2d: float) -> Columns:
+    """The inverse of a covariance with blur, whose determinant without is `sharp`."""
+    determinant = sharp + eps2d * (xx + yy - eps2d)
     return yy / determinant, -xy / determinant, xx / determinant
