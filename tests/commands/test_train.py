@@ -155,7 +155,7 @@ def test_a_run_without_a_checkpoint_starts_from_the_beginning(scene, tmp_path, m
 def test_only_process_0_checks_the_viewer_and_tensorboard(scene, tmp_path, monkeypatch, process):
     checked = []
 
-    def stop(*_):
+    def stop(*_, **__):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(train, "load_dataset", stop)
@@ -168,7 +168,7 @@ def test_only_process_0_checks_the_viewer_and_tensorboard(scene, tmp_path, monke
 
 
 def test_an_interruption_before_the_first_step_prints_one_word(scene, tmp_path, monkeypatch, capsys):
-    def interrupt(*_):
+    def interrupt(*_, **__):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(train, "load_dataset", interrupt)
@@ -390,15 +390,16 @@ def test_a_wrong_layout_or_held_out_rule_is_refused(refuses, scene, tmp_path):
 
 
 def test_resuming_and_opening_use_the_data_settings_of_the_run(scene, tmp_path, monkeypatch):
-    config = dataclasses.replace(PRESETS["demo"], format="nerfies", held_out="5", downscale=2, frame_memory=0.5)
+    options = {"downscale": 2, "format": "nerfies", "held_out": "5", "frame_memory": 0.5, "normalise": False}
+    config = dataclasses.replace(PRESETS["demo"], **options)
     runs.write_settings(tmp_path, str(scene), config)
     assert train._parse([str(scene), "--output", str(tmp_path), "--resume"]).config == config
 
-    def stop(*arguments):
-        raise UserError(repr(arguments))
+    def stop(*arguments, **options):
+        raise UserError(repr((arguments, options)))
 
     monkeypatch.setattr(sys.modules["l2dgs_jax.runs.folder"], "load_dataset", stop)
     (tmp_path / runs.CHECKPOINT).write_bytes(b"")
     with pytest.raises(UserError) as caught:
         runs.open_run(tmp_path)
-    assert str(caught.value) == repr((str(scene), 2, "nerfies", "5", 0.5))
+    assert str(caught.value) == repr(((str(scene),), options))

@@ -308,7 +308,7 @@ def check_overflow(arrays):
     assert not enough.overflow
     assert_close((enough.features, enough.alpha, enough.depth), fast(*arrays)[0], 1e-14)
     means, *others, viewmat, K = arrays
-    behind = rasterize(means - 100 * viewmat[2, :3], *others, viewmat, K, WIDTH, HEIGHT, pair_capacity=0)
+    behind = rasterize(means - 100 * viewmat[2:3, :3], *others, viewmat, K, WIDTH, HEIGHT, pair_capacity=0)
     assert not behind.overflow
     assert not behind.alpha.any()
     views = rasterize(*stacked((3, 3)), WIDTH, HEIGHT, pair_capacity=needed)
