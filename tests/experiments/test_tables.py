@@ -192,6 +192,7 @@ def test_lpips_is_added_to_members_that_were_scored_without_its_weights(tmp_path
     for one in members:
         shutil.copytree(finished_run.folder(tmp_path_factory.getbasetemp()), out / one["name"])
         (out / one["name"] / report.RESULT_FILE).write_text(json.dumps(one))
+    (out / running.PLANS_FILE).write_text("[]")
     names = [one["name"] for one in members]
     monkeypatch.setattr(running, "run_study", lambda *_, **__: report.write(out, names))
     study = tmp_path / "study.toml"
