@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import tyro
 
+from experiments import markdown
 from experiments.members import Member, labels, left_out
 from experiments.published import MEASURES, REGIONS
 from l2dgs_jax.config import overrides
@@ -184,9 +185,9 @@ def table(rows: Sequence[tuple[str, Sequence[Cells]]], measures: Sequence[str] =
         shown = []
         for region, measure in columns:
             own, *others = (_text(cells.get(region, {}).get(measure), measure) for cells in parts)
-            shown.append(own + "".join(f" ({other})" for other in others if other or measure != "area"))
+            shown.append(own + "".join(f" ({other})" for other in others if other))
         lines.append([name, *shown])
-    return "".join(f"| {' | '.join(cells)} |\n" for cells in lines)
+    return markdown.table_rows(lines)
 
 
 def _text(scores: float | Sequence[float] | None, measure: str) -> str:
@@ -194,26 +195,24 @@ def _text(scores: float | Sequence[float] | None, measure: str) -> str:
         return "" if measure == "area" else "–"
     if measure == "area":
         return f"{np.mean(scores):.0%}"
-    digits = 1 if "psnr" in measure else 2
-    spread = f" ± {np.ptp(scores) / 2:.{digits}f}" if np.size(scores) > 1 else ""
-    return f"{np.mean(scores):.{digits}f}{spread}"
+    return markdown.mean_and_spread(scores, 1 if "psnr" in measure else 2)
 
 
-def write(options: Options, name: str, members: Sequence[Member], content: Any, markdown: str) -> None:
+def write(options: Options, name: str, members: Sequence[Member], content: Any, text: str) -> None:
     """Write a table's numbers to NAME.json and the table with explanations to NAME.md, and print the latter."""
     conventions = {member["scores"]["region_convention"] for member in members if member["ended"] == report.FINISHED}
     if conventions:
         shown = " or ".join(sorted(conventions))
-        markdown += f"\nOur regions are scored by the convention {shown}, see docs/metrics.md.\n"
+        text += f"\nOur regions are scored by the convention {shown}, see docs/metrics.md.\n"
     missing = left_out(members)
     if missing:
-        markdown += f"\nLeft out of all means: {', '.join(missing)}.\n"
+        text += f"\nLeft out of all means: {', '.join(missing)}.\n"
     seeds = {member["varied"]["seed"] for member in members}
     if len(seeds) > 1:
-        markdown += f"\nMeans over {len(seeds)} seeds, ± half of the range.\n"
+        text += f"\nMeans over {len(seeds)} seeds, ± half of the range.\n"
     if options.quick:
-        markdown = f"A smoke run of {QUICK_STEPS} steps a stage: its scores mean nothing.\n\n{markdown}"
+        text = f"A smoke run of {QUICK_STEPS} steps a stage: its scores mean nothing.\n\n{text}"
     write_json(options.output / f"{name}.json", {"quick": options.quick, "left_out": missing} | content)
     with replacing(options.output / f"{name}.md") as temporary:
-        temporary.write_text(markdown)
-    print(markdown)
+        temporary.write_text(text)
+    print(text)

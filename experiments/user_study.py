@@ -19,6 +19,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import tyro
 
+from experiments.markdown import table_rows
 from experiments.published import TABLE2
 from experiments.web_page import write_page
 from l2dgs_jax.data.parsing import read_json, value
@@ -220,8 +221,7 @@ def markdown(result: dict[str, Any]) -> str:
         lines.append([method, *(f"{_text(share, 1)} / {_text(rating, 2)}" for share, rating in cells)])
     for method, pairs in TABLE2.items():
         lines.append([f"paper: {method}", *(f"{share:.1f} / {rating:.2f}" for share, rating in pairs)])
-    table = "".join(f"| {' | '.join(line)} |\n" for line in lines)
-    return f"{table}\n{result['participants']} participants; in brackets {result['interval']}.\n"
+    return f"{table_rows(lines)}\n{result['participants']} participants; in brackets {result['interval']}.\n"
 
 
 def _text(cell: dict[str, float] | None, digits: int) -> str:

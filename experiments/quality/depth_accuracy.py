@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Float32
 
+from experiments.markdown import table_rows
 from l2dgs_jax.cameras.epipolar import epipolar_geometry, project
 from l2dgs_jax.cameras.flow import pixel_indices
 from l2dgs_jax.cameras.geometry import points_inside
@@ -70,7 +71,7 @@ def markdown(accuracies: dict[str, dict[str, float | None]]) -> str:
     lines = [["", *columns], ["---"] * (len(columns) + 1)]
     for scene, found in accuracies.items():
         lines.append([scene, *("" if (x := found[name]) is None else f"{x:.1%}" for name in columns)])
-    return "".join(f"| {' | '.join(cells)} |\n" for cells in lines)
+    return table_rows(lines)
 
 
 def _median(errors: Float[np.ndarray, " N"]) -> float | None:

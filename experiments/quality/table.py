@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import tyro
 
+from experiments.markdown import mean_and_spread, table_rows
 from experiments.members import left_out
 from l2dgs_jax.data.parsing import read_json
 from l2dgs_jax.errors import UserError
@@ -130,7 +131,7 @@ def brief(found: Found) -> str:
     scenes = _scenes(found)
     lines = [["low, gain / SSIM", *scenes], ["---"] * (len(scenes) + 1)]
     lines += ([_label(row), *(_brief_cell(rows.get(scene)) for scene in scenes)] for row, rows in found.items())
-    return _lines(lines)
+    return table_rows(lines)
 
 
 def _scenes(found: Found) -> list[str]:
@@ -153,11 +154,7 @@ def _table(corner: str, rows: dict[str, dict[str, list[float]]]) -> str:
     for label, scores in rows.items():
         seeds = max(map(len, scores.values()), default=0)
         lines.append([label, str(seeds), *(_cell(name, scores.get(name)) for name in shown)])
-    return _lines(lines)
-
-
-def _lines(lines: Sequence[Sequence[str]]) -> str:
-    return "".join(f"| {' | '.join(cells)} |\n" for cells in lines)
+    return table_rows(lines)
 
 
 def _label(row: Row) -> str:
@@ -167,9 +164,7 @@ def _label(row: Row) -> str:
 def _cell(name: str, scores: list[float] | None) -> str:
     if not scores:
         return ""
-    digits = 3 if name == "SSIM" else 2
-    spread = f" ± {np.ptp(scores) / 2:.{digits}f}" if len(scores) > 1 else ""
-    return f"{np.mean(scores):.{digits}f}{spread}"
+    return mean_and_spread(scores, 3 if name == "SSIM" else 2)
 
 
 def main(arguments: Sequence[str]) -> None:

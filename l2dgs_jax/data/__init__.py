@@ -14,7 +14,8 @@ from l2dgs_jax.errors import UserError
 
 __all__ = ["LAYOUTS", "Dataset", "Split", "load_dataset"]
 
-# Each has recognizes(folder), read(folder, downscale, held_out, frame_memory) and write(dataset, folder).
+# Each has recognizes(folder), read(folder, downscale, held_out, frame_memory) and write(dataset, folder). That of
+# "nerfies" alone stores how to normalise the world, so its `read` alone can be told not to.
 LAYOUTS: dict[str, ModuleType] = {"nerfies": nerfies, "colmap": colmap, "transforms": transforms, "llff": llff}
 
 

@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 from l2dgs_jax.runs.pictures import Output
@@ -47,17 +46,15 @@ class Panel:
             self._loop = gui.add_checkbox("Loop", True)
             self._duration = gui.add_slider("Seconds", 1.0, 30.0, 0.5, 4.0, hint="From the first frame to the last")
         with gui.add_folder("Light"):
-            slider = lambda name, low, high, value, hint, **options: gui.add_slider(
-                name, low, high, 0.01, value, hint=hint, **options
-            )
-            of_parts = partial(slider, disabled=not decomposed)
+            slider = lambda name, low, high, value, hint: gui.add_slider(name, low, high, 0.01, value, hint=hint)
             self._light = Light(
-                brightness=of_parts("Brightness", 0.0, 2.0, 1.0, "0 as filmed, 1 well-lit: powers of B1 and B2"),
-                shading=of_parts("Shading", 0.0, 2.0, 1.0, "Exponent of L: 0 is light that is the same everywhere"),
+                brightness=slider("Brightness", 0.0, 2.0, 1.0, "0 as filmed, 1 well-lit: powers of B1 and B2"),
+                shading=slider("Shading", 0.0, 2.0, 1.0, "Exponent of L: 0 is light that is the same everywhere"),
                 gain=slider("Gain", -3.0, 3.0, 0.0, "On linear light, stops"),
                 warmth=slider("Warmth", -1.0, 1.0, 0.0, "White balance from blue to orange"),
                 tint=slider("Tint", -1.0, 1.0, 0.0, "White balance from green to magenta"),
             )
+            self._light.brightness.disabled = self._light.shading.disabled = not decomposed
             well_lit = gui.add_button("Well-lit again")
         with gui.add_folder("Camera"):
             self.home = gui.add_button("To the first frame")

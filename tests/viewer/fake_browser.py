@@ -9,8 +9,8 @@ import numpy as np
 class Control:
     """A slider, a switch or a button."""
 
-    def __init__(self, value, disabled=False):
-        self._value, self._callbacks, self.disabled = value, [], disabled
+    def __init__(self, value):
+        self._value, self._callbacks, self.disabled = value, [], False
 
     @property
     def value(self):
@@ -45,8 +45,8 @@ class Gui:
     def __getitem__(self, name):
         return self.controls[name]
 
-    def add_slider(self, name, low, high, step, value, hint="", disabled=False):
-        return self._add(name, value, disabled)
+    def add_slider(self, name, low, high, step, value, hint=""):
+        return self._add(name, value)
 
     def add_dropdown(self, name, options):
         return self._add(name, options[0])
@@ -63,8 +63,8 @@ class Gui:
     def add_markdown(self, text):
         return SimpleNamespace(content=text)
 
-    def _add(self, name, value, disabled=False):
-        return self.controls.setdefault(name, Control(value, disabled))
+    def _add(self, name, value):
+        return self.controls.setdefault(name, Control(value))
 
 
 class Client:
