@@ -1,6 +1,6 @@
 """Markdown for the tables of all experiments."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -14,3 +14,12 @@ def mean_and_spread(scores: float | Sequence[float], digits: int) -> str:
     """The mean and, of several scores, half of their range."""
     spread = f" ± {np.ptp(scores) / 2:.{digits}f}" if np.size(scores) > 1 else ""
     return f"{np.mean(scores):.{digits}f}{spread}"
+
+
+def percentages(found: Mapping[str, Mapping[str, float | None]]) -> str:
+    """A table of shares, a row for each scene; None has not been measured."""
+    columns = list(next(iter(found.values())))
+    lines = [["", *columns], ["---"] * (len(columns) + 1)]
+    for scene, shares in found.items():
+        lines.append([scene, *("" if (share := shares[name]) is None else f"{share:.1%}" for name in columns)])
+    return table_rows(lines)

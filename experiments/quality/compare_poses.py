@@ -2,7 +2,7 @@
 
     python -m experiments.quality.compare_poses video SCENE clip.avi  # makes a video: .avi is lossless, .mp4 is not
     python -m l2dgs_jax.prepare clip.avi OUT                          # or the folder of frames instead of the video
-    python -m experiments.quality.compare_poses compare SCENE OUT
+    python -m experiments.quality.compare_poses compare SCENE OUT [--json FILE]  # adds the numbers to those in FILE
 
 The found camera centres are aligned with the given ones by a similarity (Umeyama, PAMI 1991). Printed are the median
 and the largest distance between centres, relative to the trajectory's length, and angle between orientations.
@@ -18,7 +18,9 @@ import numpy as np
 import pycolmap
 from skimage.transform import SimilarityTransform
 
+from experiments.markdown import table_rows
 from l2dgs_jax.runtime import command_line
+from l2dgs_jax.runtime.files import write_json
 
 FPS = 10
 
@@ -30,12 +32,26 @@ def main(arguments: Sequence[str]) -> None:
     parser.add_argument("target", type=Path)
     parser.add_argument("--pictures", default="rgb/1x", help="folder of the frames within the scene")
     parser.add_argument("--skip", default="_r", help="leave out names that end like this")
+    parser.add_argument("--json", type=Path)
     options = parser.parse_args(arguments)
     paths = sorted(p for p in (options.scene / options.pictures).iterdir() if not p.stem.endswith(options.skip))
     if options.command == "video":
         make_video(paths, options.target)
-    else:
-        print(json.dumps(compare(options.scene, paths, options.target), indent=2))
+        return
+    found = compare(options.scene, paths, options.target)
+    print(json.dumps(found, indent=2))
+    if options.json:
+        others = json.loads(options.json.read_text()) if options.json.exists() else {}
+        write_json(options.json, others | {options.scene.name: found})
+
+
+def markdown(clips: dict[str, dict]) -> str:
+    """A table of the clips' medians, as --json writes them."""
+    lines = [["", "frames with a pose", "distance between centres", "angle"], ["---"] * 4]
+    for clip, found in clips.items():
+        frames = f"{found['registered']} of {found['of']}"
+        lines.append([clip, frames, f"{found['distance_median']:.2%}", f"{found['angle_median_deg']:.1f} degrees"])
+    return table_rows(lines)
 
 
 def make_video(paths: list[Path], target: Path) -> None:

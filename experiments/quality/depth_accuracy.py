@@ -17,7 +17,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Float32
 
-from experiments.markdown import table_rows
 from l2dgs_jax.cameras.epipolar import epipolar_geometry, project
 from l2dgs_jax.cameras.flow import pixel_indices
 from l2dgs_jax.cameras.geometry import points_inside
@@ -63,15 +62,6 @@ def main(arguments: Sequence[str]) -> None:
         accuracies[name] = {"whole clip": _median(together), "last sixth": _median(_parts(found)[-1])}
     if options.json:
         write_json(options.json, accuracies)
-
-
-def markdown(accuracies: dict[str, dict[str, float | None]]) -> str:
-    """A table of the medians of absolute errors, as --json writes them."""
-    columns = list(next(iter(accuracies.values())))
-    lines = [["", *columns], ["---"] * (len(columns) + 1)]
-    for scene, found in accuracies.items():
-        lines.append([scene, *("" if (x := found[name]) is None else f"{x:.1%}" for name in columns)])
-    return table_rows(lines)
 
 
 def _median(errors: Float[np.ndarray, " N"]) -> float | None:

@@ -1,21 +1,27 @@
 """How well frames follow from their neighbours: `python -m experiments.quality.flow_accuracy SCENE... [--downscale K]`.
 
+With `--json FILE`, the numbers of all scenes are written as well.
+
 Every second frame is synthesised from those before and after it, as training synthesises views between frames. A pixel
 is right if it differs from the true frame by less than three times the median difference, after blurring both by a
 pixel. Only moving pixels count, by the masks of the scene or, if it has none, by computed ones.
 """
 
 import argparse
+import sys
 from collections.abc import Sequence
+from pathlib import Path
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float32
 
+from experiments.markdown import percentages
 from l2dgs_jax.data import Split, load_dataset
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.preprocess.motion_masks import compute_masks
 from l2dgs_jax.runtime import command_line
+from l2dgs_jax.runtime.files import write_json
 from l2dgs_jax.training.flows import neighbour_flows
 from l2dgs_jax.training.inbetweens import draw
 from l2dgs_jax.types import Camera
@@ -27,7 +33,9 @@ def main(arguments: Sequence[str]) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", nargs="+")
     parser.add_argument("--downscale", type=int, default=1)
+    parser.add_argument("--json", type=Path)
     options = parser.parse_args(arguments)
+    accuracies: dict[str, dict[str, float]] = {}
     for scene in options.scenes:
         dataset = load_dataset(scene, options.downscale)
         split = dataset.train
@@ -35,9 +43,13 @@ def main(arguments: Sequence[str]) -> None:
         order = np.argsort(split.cameras.time, kind="stable")
         if not moving[order[1:-1:2]].any():
             raise UserError(f"{scene}: nothing moves in it; expected moving pixels between two frames")
-        for name, filled in (("by patches", False), ("with smooth flow", True)):
-            right, wrong = shares(split, moving, order, filled)
-            print(f"{dataset.name}, {name}: {right:.0%} of what moves comes out right, {wrong:.0%} wrong")
+        accuracies[dataset.name] = {}
+        for flow, filled in (("by patches", False), ("with smooth flow", True)):
+            for outcome, share in zip(("right", "wrong"), shares(split, moving, order, filled), strict=True):
+                accuracies[dataset.name][f"{outcome}, {flow}"] = round(float(share), 4)
+    sys.stdout.write(percentages(accuracies))
+    if options.json:
+        write_json(options.json, accuracies)
 
 
 def shares(split: Split, moving: Bool[np.ndarray, "F H W"], order: np.ndarray, filled: bool) -> np.ndarray:

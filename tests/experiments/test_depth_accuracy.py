@@ -1,20 +1,19 @@
 """Stereo between the two cameras of a scene, and the errors of seeds by it."""
 
 import json
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from experiments.markdown import percentages
 from experiments.quality import depth_accuracy
 from l2dgs_jax.data import Split
 from l2dgs_jax.data.dataset import Dataset
 from l2dgs_jax.model.initialisation import Seeds
 from l2dgs_jax.types import Camera
 
-RECORD = Path(depth_accuracy.__file__).parent
 HEIGHT, WIDTH, FOCAL, DEPTH, DISPARITY = 48, 64, 60.0, 2.0, 6
 K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]], np.float32)
 TIMES = np.array([0.0, 0.5, 1.0], np.float32)
@@ -59,11 +58,6 @@ def test_errors_are_those_of_seeds_that_are_alive_and_lie_on_what_moves(dataset)
     assert depth_accuracy.summary(np.array([0.1, -0.2, -0.3])) == "20.0% (-20.0%)"
 
 
-def test_the_documentation_shows_what_was_measured():
-    found = json.loads((RECORD / "distances.json").read_text())
-    assert depth_accuracy.markdown(found) in (RECORD.parents[1] / "docs" / "record.md").read_text()
-
-
 def test_the_numbers_are_the_medians_of_the_clip_and_of_its_end(dataset, tmp_path, monkeypatch):
     ends = [np.full(3, 0.1)] * 5 + [np.full(3, -0.3)]
     monkeypatch.setattr(depth_accuracy, "load_dataset", lambda *_: dataset)
@@ -72,4 +66,4 @@ def test_the_numbers_are_the_medians_of_the_clip_and_of_its_end(dataset, tmp_pat
     depth_accuracy.main(["here/wall", "--json", str(tmp_path / "found.json")])
     found = json.loads((tmp_path / "found.json").read_text())
     assert found == {"wall": {"whole clip": 0.1, "last sixth": 0.3}}
-    assert depth_accuracy.markdown(found).splitlines()[-1] == "| wall | 10.0% | 30.0% |"
+    assert percentages(found).splitlines()[-1] == "| wall | 10.0% | 30.0% |"

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from experiments.quality import table
+from experiments.markdown import percentages
+from experiments.quality import compare_poses, table
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.study import spec
 
@@ -126,3 +127,11 @@ def test_the_documentation_shows_what_was_measured(path):
     pages = [page.read_text() for page in (ROOT / "README.md", *(ROOT / "docs").glob("*.md"))]
     found = table.collect([path])
     assert any(shown in page for page in pages for shown in (table.markdown(found), table.brief(found)))
+
+
+@pytest.mark.parametrize(
+    ("name", "shown"), [("distances", percentages), ("flows", percentages), ("prepared", compare_poses.markdown)]
+)
+def test_the_documentation_shows_what_was_measured_without_training(name, shown):
+    pages = [page.read_text() for page in (ROOT / "docs").glob("*.md")]
+    assert any(shown(json.loads((RECORD / f"{name}.json").read_text())) in page for page in pages)
