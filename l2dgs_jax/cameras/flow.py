@@ -6,11 +6,12 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Float, Float32, Shaped, UInt8
 
 BLUR_SIGMA = 1.0  # standard deviation in pixels of the Gaussian that suppresses noise before matching
 CACHED_FLOWS = 48  # frame pairs whose flow is kept
 LOST = 3.0  # forward-backward error in pixels from which a match counts as lost
+MIN_GAIN = 0.02  # change of exposure that is worth undoing: smaller ones may be those of what moves, and do no harm
 REFINEMENT_STEPS = 10  # fixed-point iterations that refine smooth flow at full size, and SOR iterations in each
 
 
@@ -73,6 +74,26 @@ def refined(
     refinement.setFixedPointIterations(REFINEMENT_STEPS)
     refinement.setSorIterations(REFINEMENT_STEPS)
     return refinement.calc(first, second, flow.copy())  # it overwrites its argument
+
+
+def equally_exposed(first: UInt8[np.ndarray, "H W"], second: UInt8[np.ndarray, "H W"]) -> UInt8[np.ndarray, "H W"]:
+    """The second frame as bright as the first.
+
+    Patches are normalised when they are compared, so that optical flow does not depend on exposure; but whatever
+    compares the frames after it does.
+    """
+    gain = relative_gain(first, warped(second, optical_flow(first, second)))
+    return second if gain == 1 else np.clip(np.round(gain * second), 0, 255).astype(np.uint8)
+
+
+def relative_gain(first: Shaped[np.ndarray, "*S"], second: Shaped[np.ndarray, "*S"]) -> float:
+    """How much brighter the first of two pictures of the same things is; 1 if it is hardly brighter or darker.
+
+    Pixels that are 0 in one of them, as outside the picture, do not count; few that show different things do no harm.
+    """
+    known = (first > 0) & (second > 0)
+    gain = np.median(first[known] / second[known]) if known.any() else 1.0
+    return float(gain) if abs(gain - 1) > MIN_GAIN else 1.0
 
 
 def warped(image: UInt8[np.ndarray, "H W"], flow: Float32[np.ndarray, "H W 2"]) -> Float32[np.ndarray, "H W"]:

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from l2dgs_jax.cameras.geometry import points_inside
-from l2dgs_jax.data.stacks import nan_median, pixel_mean, stacked
+from l2dgs_jax.data.stacks import MappedArray, nan_median, pixel_mean, stacked
 from l2dgs_jax.runtime.prefetch import prefetch
 from l2dgs_jax.types import Camera
 
@@ -70,6 +70,12 @@ def exposures(
         gains = np.nan_to_num(nan_median((seen - nan_median(seen - gains)).swapaxes(0, 1)))[:, None]
         gains -= gains.mean(0)
     return gains[:, 0]
+
+
+def evenly_exposed(images: Float[np.ndarray, "F H W 3"], log_gains: Float[np.ndarray, "F 3"]) -> np.ndarray:
+    """The images as if none had another exposure than the rest: divided by gains as `exposures` finds them."""
+    frames = (image / np.exp(gain) for image, gain in zip(images, log_gains, strict=True))
+    return stacked(frames, images.shape, images.dtype, in_file=isinstance(images, MappedArray))
 
 
 def _observed(

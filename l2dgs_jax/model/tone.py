@@ -5,7 +5,7 @@ from typing import Literal, NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from l2dgs_jax.data.color import MID_GREY, linear_to_srgb, srgb_to_linear
 from l2dgs_jax.data.stacks import evenly_spread
@@ -106,10 +106,16 @@ def recognise(images: Float[np.ndarray, "F H W 3"], valid: Bool[np.ndarray, "F H
     return "gain" if clean and flat else "linear-light"
 
 
+def sampled_frames(count: int, valid: Bool[np.ndarray, "F H W"] | None) -> Int[np.ndarray, " N"]:
+    """Frames that stand for a clip of so many, evenly spread over those that have valid pixels."""
+    shown = np.arange(count) if valid is None else np.flatnonzero([frame.any() for frame in valid])
+    return shown[evenly_spread(len(shown), SAMPLED_FRAMES)]
+
+
 def _sampled_frames(
     images: Float[np.ndarray, "F H W 3"], valid: Bool[np.ndarray, "F H W"] | None
 ) -> Iterator[tuple[Float[np.ndarray, "H W 3"], Bool[np.ndarray, "H W"]]]:
-    for index in evenly_spread(len(images), SAMPLED_FRAMES):
+    for index in sampled_frames(len(images), valid):
         image = images[index].astype(np.float32)
         yield image, np.ones(image.shape[:2], bool) if valid is None else valid[index]
 

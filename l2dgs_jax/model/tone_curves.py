@@ -10,9 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from l2dgs_jax.data.stacks import evenly_spread
 from l2dgs_jax.model.decomposition import clip_unit
-from l2dgs_jax.model.tone import SAMPLED_FRAMES, Darkening
+from l2dgs_jax.model.tone import Darkening, sampled_frames
 from l2dgs_jax.types import ToneCurves
 
 RAMPS = 16  # linear segments of a curve
@@ -75,7 +74,7 @@ def bend(log_rises: Float[Array, "V R"]) -> Float[Array, ""]:
 
 def equalising_law(frames: Float[np.ndarray, "F H W 3"], valid: Bool[np.ndarray, "F H W"] | None) -> Darkening:
     """The power law closest to the curve that `equalisation` aims at, the pixels of all frames pooled."""
-    sampled = evenly_spread(len(frames), SAMPLED_FRAMES)
+    sampled = sampled_frames(len(frames), valid)
     pixels = jnp.asarray(frames[sampled].reshape(1, -1, *frames.shape[2:]), float)
     counted = None if valid is None else jnp.asarray(valid[sampled].reshape(1, -1, frames.shape[2]))
     log_dark, log_lit = np.asarray(_log_quantiles(pixels, counted)[0]), np.log(KNOTS)

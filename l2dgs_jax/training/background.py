@@ -15,6 +15,7 @@ from l2dgs_jax.training.tracks import Tracks
 
 CLIP_PART = 240  # instants of a part of a long clip, which is compared with itself: elsewhere, little of it is in view
 MAX_FRAMES = 60  # frames of a part that colours of static surfaces are taken from
+MAX_PIXELS = 300_000  # that are compared at once, as each needs its colours in all of these frames
 MIN_SEEN = 3  # of these, in which a surface must be seen
 REACH = 9  # side in pixels of the square around a track in which static surfaces may be hidden
 BLUR_SIGMA = 1.0  # standard deviation in pixels of the Gaussian that suppresses noise
@@ -58,13 +59,15 @@ def likeness_to_background(
     likeness = Likeness(*np.zeros((2, len(frames)), bool))
     for span in np.array_split(np.arange(len(times)), -(-len(times) // CLIP_PART)):
         part = np.flatnonzero(np.isin(instants, span))
-        asked = np.isin(frames, part)
-        if asked.any():
-            here, elsewhere = _colors(frames[asked], pixels[asked], part.tolist(), split, backdrop, tracks)
-            known = np.isfinite(here).all(-1) & (np.isfinite(elsewhere[..., 0]).sum(0) >= MIN_SEEN)
+        asked = np.flatnonzero(np.isin(frames, part))
+        if len(asked):
+            chunks = np.array_split(asked, -(-len(asked) // MAX_PIXELS))
+            colors = [_colors(frames[chunk], pixels[chunk], part.tolist(), split, backdrop, tracks) for chunk in chunks]
+            here, elsewhere = (np.concatenate(parts) for parts in zip(*colors, strict=True))
+            known = np.isfinite(here).all(-1) & np.isfinite(elsewhere).all(-1)
             alike = known.copy()
             if known.any():
-                alike[known] = _alike(here[known], nan_median(elsewhere[:, known]))
+                alike[known] = _alike(here[known], elsewhere[known])
             likeness.alike[asked], likeness.differs[asked] = alike, known & ~alike
     return likeness
 
@@ -76,8 +79,8 @@ def _colors(
     split: Split,
     backdrop: Backdrop,
     tracks: Tracks,
-) -> tuple[Float32[np.ndarray, "N 3"], Float32[np.ndarray, "S N 3"]]:
-    """Light at the pixels, NaN where not valid, and of what they hide, NaN in those of S frames that do not show it."""
+) -> tuple[Float32[np.ndarray, "N 3"], Float32[np.ndarray, "N 3"]]:
+    """Light at the pixels, NaN where not valid, and of what they hide, NaN where hardly any frame shows it."""
     height, width = split.images.shape[1:3]
     viewmats, Ks, _ = backdrop.cameras
     surfaces = unprojected(backdrop.cameras, frames, pixels, hidden_depths(backdrop, frames, pixels))
@@ -102,7 +105,10 @@ def _colors(
             seen = np.flatnonzero((depth > 0) & ((places >= 0) & (places < (width, height))).all(-1))  # never NaN
             column, row = places[seen].astype(int).T
             elsewhere[chosen.index(frame), seen] = light[row, column]
-    return here, elsewhere
+    enough = np.isfinite(elsewhere[..., 0]).sum(0) >= MIN_SEEN
+    typical = np.full_like(here, np.nan)
+    typical[enough] = nan_median(elsewhere[:, enough])
+    return here, typical
 
 
 def _alike(here: Float32[np.ndarray, "N 3"], elsewhere: Float32[np.ndarray, "N 3"]) -> Bool[np.ndarray, " N"]:

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float16, Float32, Int, UInt8
 
-from l2dgs_jax.cameras.flow import brightened, match, optical_flow, smooth_flow, warped
+from l2dgs_jax.cameras.flow import brightened, equally_exposed, match, optical_flow, smooth_flow, warped
 from l2dgs_jax.cameras.geometry import camera_centres
 from l2dgs_jax.cameras.jumps import follow_jumps, unexplained
 from l2dgs_jax.data.dataset import Split
@@ -47,7 +47,7 @@ def neighbour_flows(split: Split, *, filled: bool = False) -> Flows:
     following, greys = _following(split.cameras), brightened(split.images)
 
     def both_directions(frame: int) -> Float16[np.ndarray, "2 H W 2"]:
-        first, second = greys[frame], greys[following[frame]]
+        first, second = greys[frame], equally_exposed(greys[frame], greys[following[frame]])
         found = _with_jumps(first, second, 0.0 if filled else MIN_JUMP)
         for size in SMOOTH_FLOW_SIZES if filled else ():
             smooth = _consistent(smooth_flow(first, second, size), smooth_flow(second, first, size))

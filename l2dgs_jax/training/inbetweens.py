@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float16, Float32
 
-from l2dgs_jax.cameras.flow import pixel_indices
+from l2dgs_jax.cameras.flow import pixel_indices, relative_gain
 from l2dgs_jax.cameras.geometry import between
 from l2dgs_jax.data.dataset import Split
 from l2dgs_jax.training.flows import Flows
@@ -42,7 +42,7 @@ def draw(split: Split, flows: Flows, frame: int, part: float) -> View:
     """The view `part` of the way from a frame to the following one.
 
     Its image is that of the nearer of the two, warped. A pixel is valid where the flow of both is known and the warped
-    frames agree on its colour, which they do not at occlusions.
+    frames, made equally bright, agree on its colour, which they do not at occlusions.
     """
     other = int(flows.following[frame])
     forward, backward = flows.displacements[frame].astype(np.float32)
@@ -54,7 +54,8 @@ def draw(split: Split, flows: Flows, frame: int, part: float) -> View:
     ends = (frame, other)
     (first, first_seen), (second, second_seen) = (_warped(split, *end) for end in zip(ends, to_frames, strict=True))
     valid = first_seen & second_seen
-    difference = np.maximum(_dissimilarity(first, second), _dissimilarity(second, first))
+    as_bright = relative_gain(first[valid], second[valid]) * second
+    difference = np.maximum(_dissimilarity(first, as_bright), _dissimilarity(as_bright, first))
     difference = cv2.blur(np.where(valid, difference, 0), (3, 3))
     valid &= difference < MAX_OVER_MEDIAN * (np.median(difference[valid]) if valid.any() else 0) + MARGIN
     nearer, shown = (first, frame) if part < 0.5 else (second, other)  # their mean would be less noisy, but blurred

@@ -12,7 +12,7 @@ from l2dgs_jax.data.dataset import Dataset, Split
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.model import networks
 from l2dgs_jax.model.initialisation import initialise, path_knots, scene_shapes, z_order
-from l2dgs_jax.model.observation import exposures, observed_colors
+from l2dgs_jax.model.observation import evenly_exposed, exposures, observed_colors
 from l2dgs_jax.model.tone import Darkening, darkening, lit_level, recognise
 from l2dgs_jax.model.tone_curves import equalising_law, power_law
 from l2dgs_jax.runtime.capacity import next_capacity
@@ -99,8 +99,12 @@ def initial_state(dataset: Dataset, config: Config) -> TrainState:
     """The state before the first step of a `resolve`d config; the same seed and data give the same state."""
     train, points = dataset.train, dataset.points
     colors = dataset.colors if config.model.initial_illumination is None else None  # what they are needed for
+    gains, even = None, train
+    if config.model.exposure == "drifting":
+        gains = exposures(points, train.cameras, train.images, train.valid)
+        even = dataclasses.replace(train, images=evenly_exposed(train.images, gains))
     if config.model.surfaces:
-        found = find_surfaces(points, train, most=max(int(config.density.max_gaussians) - len(points), 0))
+        found = find_surfaces(points, even, most=max(int(config.density.max_gaussians) - len(points), 0))
         if colors is not None:
             colors = np.concatenate([colors, observed_colors(found, train.cameras, train.images, train.valid)])
         points = np.concatenate([points, found])
@@ -110,7 +114,7 @@ def initial_state(dataset: Dataset, config: Config) -> TrainState:
     if config.model.tracks:
         # Not the added points: the nearest ones of so many are too near to give the depth of what moves.
         most = min(_max_gaussians(train), int(config.density.max_gaussians))
-        seeds = find_seeds(dataset.points, train, path_knots(config.model, len(train.names)), most)
+        seeds = find_seeds(dataset.points, even, path_knots(config.model, len(train.names)), most)
     capacity = len(points) + (0 if seeds is None else len(seeds.points))
     if config.density.start < config.density.stop:
         limit = max(int(config.density.max_gaussians), capacity)
@@ -122,9 +126,6 @@ def initial_state(dataset: Dataset, config: Config) -> TrainState:
         if seeds is not None:
             observed = np.concatenate([observed, seeds.colors])
         reflectance = law.undone(observed)
-    gains = None
-    if config.model.exposure == "drifting":
-        gains = exposures(points, train.cameras, train.images, train.valid)
     key = jax.random.key(config.seed)
     curve = power_law(split_darkening(train, config)) if config.model.decomposition == "curve" else None
     scene = initialise(key, points, colors, train.cameras, config.model, capacity, reflectance, gains, seeds, curve)

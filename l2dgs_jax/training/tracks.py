@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, Shaped, UInt8
 
 from l2dgs_jax.cameras.epipolar import epipolar_geometry, project
-from l2dgs_jax.cameras.flow import brightened, pixel_indices
+from l2dgs_jax.cameras.flow import brightened, equally_exposed, pixel_indices
 from l2dgs_jax.data.dataset import Split
 from l2dgs_jax.training.backdrop import DEPTH_CELL
 from l2dgs_jax.training.flows import Flows
@@ -92,7 +92,8 @@ def find_tracks(split: Split, flows: Flows, depths: Float32[np.ndarray, "C F h w
         inverse_depths = 1 / depths[:, frame].repeat(DEPTH_CELL, 1).repeat(DEPTH_CELL, 2)[:, :height, :width]
         static = [project(geometry, pixels, inverse).astype(np.float32) for inverse in inverse_depths]
         flow = flows.displacements[frame, 0].astype(np.float32)
-        deviations, moves = _moving(greys[frame], greys[following], static, pixels + flow)
+        first, second = greys[frame], equally_exposed(greys[frame], greys[following])
+        deviations, moves = _moving(first, second, static, pixels + flow)
         fresh = grid[_at(moves, grid) & ~np.isin(_cells(grid, width), _cells(heads.pixels, width))]
         heads = _joined([heads, _Heads(count + np.arange(len(fresh)), fresh, np.zeros(len(fresh)))])
         count += len(fresh)
@@ -194,7 +195,7 @@ def _moving(
 
     Args:
         first: brightened grey frame.
-        second: likewise.
+        second: likewise, as bright as the first.
         static: pixels of the second frame where a static scene would appear, for each candidate of its depth.
         moved: pixels of the second frame that flow leads to; NaN where it is not trusted.
     """

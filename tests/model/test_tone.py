@@ -9,6 +9,7 @@ from skimage.transform import resize
 
 from l2dgs_jax.data.color import linear_to_srgb, srgb_to_linear
 from l2dgs_jax.model.tone import darkening, lit_level, recognise
+from l2dgs_jax.model.tone_curves import equalising_law
 
 
 def test_transfer_functions_are_inverse_and_agree_with_scikit_image():
@@ -98,6 +99,15 @@ def test_recognition_uses_valid_pixels_only():
     assert recognise(frames, valid) == "linear-light"
     valid[:, :, 56:] = False
     assert recognise(frames, valid) == "gain"
+
+
+def test_frames_without_valid_pixels_are_not_sampled():
+    frames = np.full((40, 16, 16, 3), 0.1, np.float32)
+    valid = np.zeros(frames.shape[:3], bool)
+    valid[5:7] = True
+    assert recognise(frames, valid) == "gain"
+    assert lit_level(frames, valid, 0.1, of_light=True) == lit_level(frames, None, 0.1, of_light=True)
+    np.testing.assert_allclose(equalising_law(frames, valid), equalising_law(frames, None))
 
 
 def lit(frames, of_light=True, valid=None):

@@ -114,3 +114,11 @@ def test_frames_of_several_cameras_count_as_one_instant(monkeypatch):
     found = likeness_to_background(tracks.frames, tracks.pixels, rig, backdrop(rig), tracks)
     np.testing.assert_array_equal(found, whole)
     assert np.any(np.not_equal(expected, whole))
+
+
+def test_many_pixels_are_compared_in_turn(monkeypatch):
+    split, tracks = seen()
+    expected = likeness_to_background(tracks.frames, tracks.pixels, split, backdrop(split), tracks)
+    monkeypatch.setattr(background, "MAX_PIXELS", 7)
+    in_turn = likeness_to_background(tracks.frames, tracks.pixels, split, backdrop(split), tracks)
+    np.testing.assert_array_equal(in_turn, expected)

@@ -1,6 +1,7 @@
 """Exposure gains of the frames, learned together with the scene."""
 
 import dataclasses
+import sys
 
 import jax.numpy as jnp
 import numpy as np
@@ -9,6 +10,7 @@ from jax.test_util import check_grads
 from tiny_training import FRAMES, finish, make_dataset, state_of, tiny
 
 from l2dgs_jax.config import overrides
+from l2dgs_jax.model.observation import evenly_exposed, exposures
 from l2dgs_jax.training import initial_state, objective, resolve
 from l2dgs_jax.training.batching import load_batch
 
@@ -39,16 +41,33 @@ def test_training_starts_from_the_gains_that_the_frames_show():
     assert initial_state(drifting_dataset(), config_of("steady")).scene.params.exposures is None
 
 
+def test_exposures_that_are_undone_leave_no_drift():
+    dataset = drifting_dataset()
+    gains = exposures(dataset.points, dataset.train.cameras, dataset.train.images)
+    even = evenly_exposed(dataset.train.images, gains).astype(np.float32)
+    np.testing.assert_allclose(even, np.tile(even[:1], (FRAMES, 1, 1, 1)), rtol=0.02)
+
+
+@pytest.mark.parametrize(("exposure", "even"), [("drifting", True), ("steady", False)])
+def test_what_moves_is_looked_for_in_evenly_exposed_frames(exposure, even, monkeypatch):
+    seen = []
+    module = sys.modules["l2dgs_jax.training.initial_state"]
+    monkeypatch.setattr(module, "find_seeds", lambda points, split, *_: seen.append(split.images))
+    initial_state(drifting_dataset(), config_of(exposure, **{"model.tracks": True}))
+    means = seen[0].astype(np.float32).mean((1, 2, 3))
+    assert (np.ptp(means) < 0.02 * means.mean()) == even
+
+
 def test_renderings_are_exposed_like_their_frames():
     images = jnp.full((2, 3, 4, 3), 0.2)
-    exposures = jnp.log(jnp.array([[1.0, 1, 1], [2, 4, 8], [1, 0.25, 0.125]]))
-    exposed = objective.exposed(images, exposures, jnp.array([1, 2]))
+    log_gains = jnp.log(jnp.array([[1.0, 1, 1], [2, 4, 8], [1, 0.25, 0.125]]))
+    exposed = objective.exposed(images, log_gains, jnp.array([1, 2]))
     # Relative to their geometric mean, which is [2, 1, 1]^(1/3).
     np.testing.assert_allclose(exposed[0, 0, 0], 0.2 * np.array([2, 4, 8]) / np.array([2 ** (1 / 3), 1, 1]), rtol=1e-6)
     np.testing.assert_allclose(
         exposed[1, 0, 0], 0.2 * np.array([1, 0.25, 0.125]) / np.array([2 ** (1 / 3), 1, 1]), rtol=1e-6
     )
-    check_grads(lambda *x: objective.exposed(*map(jnp.asarray, x), jnp.array([1, 2])), (images, exposures), 1)
+    check_grads(lambda *x: objective.exposed(*map(jnp.asarray, x), jnp.array([1, 2])), (images, log_gains), 1)
 
 
 @pytest.mark.slow

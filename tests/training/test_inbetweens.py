@@ -69,6 +69,17 @@ def test_a_view_between_two_frames_shows_the_true_image(split, flows, part):
     np.testing.assert_allclose(view.camera.viewmat[0, 3], -0.1 * (1 + part), rtol=1e-5)
 
 
+def test_frames_of_different_exposure_agree_and_views_between_them_have_that_of_the_nearer(split, flows):
+    gains = np.where(split.cameras.time * (FRAMES - 1) % 2, 0.7, 1).astype(np.float16)
+    flickering = dataclasses.replace(split, images=split.images * gains[:, None, None, None])
+    found = neighbour_flows(flickering, filled=True)
+    for frame in np.flatnonzero(flows.following != np.arange(FRAMES)).tolist():
+        steady, view = draw(split, flows, frame, 0.3), draw(flickering, found, frame, 0.3)
+        assert view.valid.mean() > steady.valid.mean() - 0.05
+        both = view.valid & steady.valid
+        np.testing.assert_allclose(view.image[both], gains[frame] * steady.image[both], rtol=0.1)
+
+
 def test_depth_is_given_only_at_valid_pixels_of_real_frames(split, flows):
     depths = np.full(split.images.shape[:-1], 2.0, np.float32)
     valid = np.ones(depths.shape, bool)

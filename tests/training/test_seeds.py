@@ -88,6 +88,15 @@ def test_seeds_follow_and_cover_the_moving_square(frame):
     assert covered_share(squares[frame], at) > 0.85
 
 
+def test_seeds_are_found_however_the_exposure_flickers():
+    split, squares = filmed(block=True)
+    gains = np.where(np.arange(COUNT) % 2, 0.8, 1.0).astype(np.float16)
+    flickering = dataclasses.replace(split, images=split.images * gains[:, None, None, None])
+    seeds = find_seeds(surfaces(), flickering, KNOTS, MANY)
+    for frame in (2, 6, 11):
+        assert covered_share(squares[frame], places(seeds, split, frame)) > 0.8
+
+
 @pytest.mark.parametrize("every", [3, 6])
 def test_what_moves_by_half_its_size_or_more_from_frame_to_frame_is_covered(every):
     split, squares = filmed(block=True)
