@@ -145,6 +145,7 @@ def test_a_failure_midway_leaves_the_scene_as_it_was(scene, monkeypatch):
 
 def test_invalid_input_gives_one_sentence_before_any_work(scene, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(masks, "compute_masks", lambda dataset: pytest.fail("too late"))
+    monkeypatch.chdir(tmp_path)  # where no folder is called "demo"
     assert "no such folder" in error_of(capsys, [tmp_path / "missing"])
     assert "no folder to write masks to" in error_of(capsys, ["demo"])
     assert "not a picture's suffix" in error_of(capsys, [scene, "--preview", tmp_path / "preview.txt"])
