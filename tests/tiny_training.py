@@ -43,16 +43,16 @@ def tiny(preset="default", **changes):
     return dataclasses.replace(base, **few | {"density": density, "loss": loss, "model": small} | changes)
 
 
-def make_dataset(seed=0):
+def make_dataset(seed=0, width=WIDTH, height=HEIGHT):
     rng = np.random.default_rng(seed)
     points = rng.uniform([-1, -0.7, 2], [1, 0.7, 3], (25, 3)).astype(np.float32)
     viewmat = np.tile(np.eye(4, dtype=np.float32), (FRAMES, 1, 1))
     viewmat[:, 0, 3] = np.linspace(-0.2, 0.2, FRAMES)
     intrinsics = np.tile(np.array([[14, 0, 8], [0, 14, 6], [0, 0, 1]], np.float32), (FRAMES, 1, 1))
     cameras = Camera(viewmat, intrinsics, np.linspace(0, 1, FRAMES, dtype=np.float32))
-    images = rng.uniform(0, 0.2, (FRAMES, HEIGHT, WIDTH, 3)).astype(np.float16)
+    images = rng.uniform(0, 0.2, (FRAMES, height, width, 3)).astype(np.float16)
     split = Split(tuple(map(str, range(FRAMES))), cameras, images, None, None)
-    return Dataset("tiny", WIDTH, HEIGHT, split, split, points, None)
+    return Dataset("tiny", width, height, split, split, points, None)
 
 
 def batch_of(split, frames):

@@ -12,6 +12,7 @@ BLUR_SIGMA = 1.0  # standard deviation in pixels of the Gaussian that suppresses
 CACHED_FLOWS = 48  # frame pairs whose flow is kept
 LOST = 3.0  # forward-backward error in pixels from which a match counts as lost
 MIN_GAIN = 0.02  # change of exposure that is worth undoing: smaller ones may be those of what moves, and do no harm
+MIN_SIDES = 8, 12  # pixels, shorter and longer side of the smallest pictures that `optical_flow` takes
 REFINEMENT_STEPS = 10  # fixed-point iterations that refine smooth flow at full size, and SOR iterations in each
 
 

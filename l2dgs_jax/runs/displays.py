@@ -11,7 +11,6 @@ A display is called for every event, `display(event, **facts)`:
 """
 
 import contextlib
-import json
 import os
 import sys
 import time
@@ -19,6 +18,8 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 from tqdm import tqdm
+
+from l2dgs_jax.runtime.files import as_json
 
 Display = Callable[..., None]
 
@@ -59,7 +60,7 @@ def _as_json(event: str, facts: dict[str, Any]) -> str:
     """A JSON object and its newline, to be printed in one piece because several threads report events."""
     if event == "step":
         return ""
-    return json.dumps(facts if event == "metrics" else {"event": event} | facts) + "\n"
+    return as_json(facts if event == "metrics" else {"event": event} | facts) + "\n"
 
 
 class _Steps(tqdm):

@@ -149,7 +149,8 @@ def read_metrics(folder: Path) -> list[dict[str, Any]]:
     lines = []
     for line in path.read_text(errors="replace").splitlines() if path.exists() else ():
         try:
-            lines.append(json.loads(line))
+            content = json.loads(line)
         except ValueError:
             break
+        lines.append(content | {"psnr": float(content["psnr"])})  # infinite if a step had no valid pixel
     return lines

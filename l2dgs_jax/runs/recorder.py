@@ -1,6 +1,5 @@
 """Recording a training in its run folder: metrics and checkpoints."""
 
-import json
 import time
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,7 @@ from l2dgs_jax.runs.checkpoints import Checkpoint
 from l2dgs_jax.runs.divergence import rate_factor
 from l2dgs_jax.runs.folder import CHECKPOINT, COARSE, METRICS, read_metrics
 from l2dgs_jax.runtime import devices
-from l2dgs_jax.runtime.files import append_line, replacing
+from l2dgs_jax.runtime.files import append_line, as_json, replacing
 from l2dgs_jax.runtime.memory import memory_in_use
 from l2dgs_jax.training import Progress
 from l2dgs_jax.training.optimizer import learning_rates
@@ -48,7 +47,7 @@ class Recorder:
         """
         self.folder, self.config, self.halvings, self.begun = folder, config, halvings, time.monotonic()
         self.step = self._saved = done
-        kept = [json.dumps(line) for line in read_metrics(folder) if line["step"] <= done]
+        kept = [as_json(line) for line in read_metrics(folder) if line["step"] <= done]
         with replacing(folder / METRICS) as temporary:
             temporary.write_text("".join(f"{line}\n" for line in kept))
 
@@ -70,7 +69,7 @@ class Recorder:
         # Metrics first: those after the last checkpoint are removed when the run resumes from it.
         line = self._line(progress, member) if self.step % LOG_EVERY == 0 or last else None
         if line:
-            append_line(self.folder / METRICS, json.dumps(line))
+            append_line(self.folder / METRICS, as_json(line))
         if self.step == config.coarse_steps:
             self._save(progress, member, COARSE, 1)
         if self.step % config.checkpoint_every == 0 or last:

@@ -113,18 +113,24 @@ def new_folder(path: Path) -> Iterator[Path]:
 
 
 def write_json(path: Path, content: Any) -> None:
-    """Write a JSON file, whole or not at all, and create its folder.
-
-    Numbers that JSON lacks become the strings "Infinity", "-Infinity" and "NaN", as in the JSON of Protocol Buffers;
-    Python's `float` reads them.
+    """Write a JSON file (see `as_json`), whole or not at all, and create its folder.
 
     Raises:
         UserError: the folder cannot be created, or as `replacing`.
     """
     make_folder(path.parent)
     with replacing(path) as temporary:
-        temporary.write_text(json.dumps(_spelled_out(content), indent=2, allow_nan=False) + "\n")
+        temporary.write_text(as_json(content, indent=2) + "\n")
         flush(temporary)
+
+
+def as_json(content: Any, indent: int | None = None) -> str:
+    """The content as JSON that every reader takes.
+
+    Numbers that JSON lacks become the strings "Infinity", "-Infinity" and "NaN", as in the JSON of Protocol Buffers;
+    Python's `float` reads them.
+    """
+    return json.dumps(_spelled_out(content), indent=indent, allow_nan=False)
 
 
 def _spelled_out(content: Any) -> Any:

@@ -2,12 +2,14 @@
 
 import dataclasses
 
+import cv2
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scenes import write_nerfies
 from tiny_training import assert_equal_states, make_dataset, tiny
 
+from l2dgs_jax.cameras.flow import MIN_SIDES, brightened, optical_flow
 from l2dgs_jax.config import PRESETS, overrides
 from l2dgs_jax.data import load_dataset
 from l2dgs_jax.errors import UserError
@@ -72,6 +74,23 @@ def test_frames_without_a_valid_pixel_are_refused(dataset):
     transparent = dataclasses.replace(dataset.train, valid=np.zeros(dataset.train.images.shape[:3], bool))
     with pytest.raises(UserError, match="tiny: all its training frames are black or transparent; expected"):
         resolve(tiny(), dataclasses.replace(dataset, train=transparent))
+
+
+@pytest.mark.parametrize("size", [(8, 11), (7, 12)])
+def test_frames_too_small_for_optical_flow_are_refused(size):
+    height, width = size
+    small = make_dataset(width=width, height=height)
+    with pytest.raises(UserError, match=f"frames of {width}x{height} pixels are too small for optical flow; expected"):
+        resolve(tiny(inbetweens=0.1), small)
+    resolve(tiny(), small)
+    with pytest.raises(cv2.error):
+        optical_flow(*brightened(small.train.images)[:2])
+
+
+def test_the_smallest_frames_have_optical_flow():
+    small = make_dataset(width=MIN_SIDES[1], height=MIN_SIDES[0])
+    resolve(tiny(inbetweens=0.1), small)
+    assert np.isfinite(optical_flow(*brightened(small.train.images)[:2])).all()
 
 
 def test_points_behind_all_cameras_are_refused(dataset):

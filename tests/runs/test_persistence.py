@@ -204,6 +204,21 @@ def test_a_torn_line_of_metrics_is_dropped(dataset, uninterrupted, tmp_path):
     assert metrics(tmp_path) == metrics(uninterrupted[0])
 
 
+def test_metrics_of_steps_without_a_valid_pixel_are_json(dataset, tmp_path, monkeypatch):
+    def step(*arguments, **options):
+        states, found, tally = counting_step(*arguments, **options)
+        return states, found._replace(psnr=jnp.full_like(found.psnr, jnp.inf)), tally
+
+    monkeypatch.setattr(engine, "train_steps", step)
+    with pytest.raises(Interrupted):
+        train_to_end(tmp_path, dataset, Watcher(stop_after=4))
+    train_to_end(tmp_path, dataset)
+    written = (tmp_path / runs.METRICS).read_text()
+    for line in written.splitlines():
+        assert json.loads(line, parse_constant=pytest.fail)["psnr"] == "Infinity"
+    assert {line["psnr"] for line in runs.read_metrics(tmp_path)} == {float("inf")}
+
+
 @pytest.mark.parametrize("name", ["fsync", "replace"])
 def test_a_full_disk_is_reported_in_one_sentence_and_loses_nothing(dataset, uninterrupted, tmp_path, monkeypatch, name):
     with pytest.raises(Interrupted):
