@@ -19,6 +19,7 @@ from l2dgs_jax.errors import UserError
 from l2dgs_jax.runtime.prefetch import prefetch
 from l2dgs_jax.types import Camera
 
+MAX_ROUNDING = 0.5  # pixels by which single precision may move the image of a point
 INVERTED_BELOW = -0.3  # correlation of given depth and depth of the points: below it, the given one is inverse depth
 LINEAR_NOTE = "pictures of floating-point values are taken as linear light and converted to sRGB"
 
@@ -85,8 +86,8 @@ def assemble(
         notes: assumptions of the reader.
 
     Raises:
-        UserError: a picture is missing, damaged, or of another size than its camera or the other pictures; or a camera
-            or point has values too large for single precision; or depth and points contradict each other; or there is
+        UserError: a picture is missing, damaged, or of another size than its camera or the other pictures; or cameras
+            and points have values too large for single precision; or depth and points contradict each other; or there is
             no room for the temporary files.
     """
     frames = [*train, *test]
@@ -97,6 +98,7 @@ def assemble(
         notes = (*notes, LINEAR_NOTE)
     masked = [frame for frame in frames if frame.mask]
     _check_pictures([frame.mask for frame in masked if frame.mask], masked)
+    _check_precision(folder, frames, points)
     width, height = full[0] // downscale, full[1] // downscale
     # Bytes per pixel; masks, which take a sixth of what pictures take, are not counted.
     size = 6 * (1 + (folder / "well").is_dir()) + 4 * any((folder / kind).is_dir() for kind in depth_maps.FOLDERS)
@@ -123,6 +125,23 @@ def assemble(
         colors=colors,
         notes=tuple(dict.fromkeys((*notes, *train_notes, *test_notes))),
     )
+
+
+def _check_precision(folder: Path, frames: Sequence[Frame], points: Float[np.ndarray, "P 3"]) -> None:
+    """Check that rounding to single precision leaves points in their places in the images, as it may far from 0."""
+    sample = points[:: len(points) // 1000 + 1]
+    for frame in frames[:: len(frames) // 16 + 1]:
+        exact = sample @ frame.viewmat[:3, :3].T + frame.viewmat[:3, 3]
+        camera = _single(frame.viewmat, f"{frame.source}: the camera").astype(float)
+        rounded = _single(sample, f"{folder}: a point") @ camera[:3, :3].T + camera[:3, 3]
+        ahead = exact[:, 2] > 0
+        moved = np.linalg.norm(rounded - exact, axis=-1)[ahead] / exact[ahead, 2] * frame.K[0, 0]
+        if len(moved) and np.median(moved) > MAX_ROUNDING:
+            raise UserError(
+                f"{folder}: its coordinates, of up to {np.abs(sample).max():.0e}, are too large for single precision, "
+                f"which moves points by {np.median(moved):.1f} pixels; expected an origin near the scene: subtract the "
+                "same offset from points and camera centres"
+            )
 
 
 def _common_size(frames: Sequence[Frame]) -> tuple[int, int]:

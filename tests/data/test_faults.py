@@ -1,5 +1,6 @@
 """Whatever is wrong with a scene, the error message is one sentence."""
 
+import json
 import shutil
 from pathlib import Path
 
@@ -143,3 +144,16 @@ def test_a_scene_beyond_single_precision_is_refused(scene):
     edit_json(scene / CAMERA, position=[0, 1e300, 0])
     with pytest.raises(UserError, match=f"{CAMERA}: the camera holds values beyond"):
         data.load_dataset(scene)
+
+
+@pytest.mark.parametrize("offset", [1e3, 1e7])
+def test_a_scene_far_from_its_origin_is_refused_if_rounding_would_blur_it(scene, offset):
+    """As in coordinates of a map; those of a surveyed site do no harm."""
+    np.save(scene / "points.npy", np.load(scene / "points.npy").astype(float) + offset)
+    for path in (scene / "camera").iterdir():
+        edit_json(path, position=[x + offset for x in json.loads(path.read_text())["position"]])
+    if offset < 1e4:
+        data.load_dataset(scene)
+    else:
+        with pytest.raises(UserError, match=r"scene: its coordinates, of up to 5e\+06, are too large .* by .* pixels"):
+            data.load_dataset(scene)
