@@ -87,8 +87,8 @@ def assemble(
 
     Raises:
         UserError: a picture is missing, damaged, or of another size than its camera or the other pictures; or cameras
-            and points have values too large for single precision; or depth and points contradict each other; or there is
-            no room for the temporary files.
+            or points have values too large for single precision; or depth and points contradict each other; or there
+            is no room for the temporary files.
     """
     frames = [*train, *test]
     full = _common_size(frames)
