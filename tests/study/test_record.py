@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from experiments import table1
 from experiments.markdown import percentages
 from experiments.quality import compare_poses, table
 from l2dgs_jax.errors import UserError
@@ -135,3 +136,14 @@ def test_the_documentation_shows_what_was_measured(path):
 def test_the_documentation_shows_what_was_measured_without_training(name, shown):
     pages = [page.read_text() for page in (ROOT / "docs").glob("*.md")]
     assert any(shown(json.loads((RECORD / f"{name}.json").read_text())) in page for page in pages)
+
+
+def test_the_documentation_shows_table_1_as_measured():
+    scenes = json.loads((ROOT / "experiments/studies/results/table1.json").read_text())["scenes"]
+    assert table1.markdown(scenes) in (ROOT / "docs" / "comparison.md").read_text()
+    for scene, methods in scenes.items():
+        for region in methods["L2DGS"]:
+            for measure in ("ssim", "psnr_gain"):
+                worst = min(methods["L2DGS"][region][measure])
+                others = [methods[name][region][measure] for name in methods if name != "L2DGS"]
+                assert worst > max(map(max, others)), f"{scene}: {measure} of the {region} region"
