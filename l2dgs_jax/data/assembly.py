@@ -10,6 +10,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Bool, Float, Float16, Float32, UInt8
 
+from l2dgs_jax.cameras.geometry import project_points
 from l2dgs_jax.data import depth_maps, images
 from l2dgs_jax.data.dataset import Dataset, Original, Split
 from l2dgs_jax.data.lens import Lens, scale_intrinsics, seen, undistort, without_skew
@@ -130,17 +131,17 @@ def assemble(
 def _check_precision(folder: Path, frames: Sequence[Frame], points: Float[np.ndarray, "P 3"]) -> None:
     """Check that rounding to single precision leaves points in their places in the images, as it may far from 0."""
     sample = points[:: len(points) // 1000 + 1]
+    rounded = _single(sample, f"{folder}: a point").astype(float)
     for frame in frames[:: len(frames) // 16 + 1]:
-        exact = sample @ frame.viewmat[:3, :3].T + frame.viewmat[:3, 3]
-        camera = _single(frame.viewmat, f"{frame.source}: the camera").astype(float)
-        rounded = _single(sample, f"{folder}: a point") @ camera[:3, :3].T + camera[:3, 3]
-        ahead = exact[:, 2] > 0
-        moved = np.linalg.norm(rounded - exact, axis=-1)[ahead] / exact[ahead, 2] * frame.K[0, 0]
-        if len(moved) and np.median(moved) > MAX_ROUNDING:
+        viewmat = _single(frame.viewmat, f"{frame.source}: the camera").astype(float)
+        exact, depth = project_points(sample, frame.viewmat, frame.K)
+        shifts = np.linalg.norm(project_points(rounded, viewmat, frame.K)[0] - exact, axis=-1)[depth > 0]
+        shift = np.median(np.nan_to_num(shifts, nan=np.inf)) if len(shifts) else 0.0
+        if shift > MAX_ROUNDING:
             raise UserError(
                 f"{folder}: its coordinates, of up to {np.abs(sample).max():.0e}, are too large for single precision, "
-                f"which moves points by {np.median(moved):.1f} pixels; expected an origin near the scene: subtract the "
-                "same offset from points and camera centres"
+                f"which moves points by {shift:.1f} pixels; expected an origin near the scene: subtract the same "
+                "offset from points and camera centres"
             )
 
 
