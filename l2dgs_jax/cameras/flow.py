@@ -8,11 +8,13 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Shaped, UInt8
 
+from l2dgs_jax.errors import UserError
+
 BLUR_SIGMA = 1.0  # standard deviation in pixels of the Gaussian that suppresses noise before matching
 CACHED_FLOWS = 48  # frame pairs whose flow is kept
 LOST = 3.0  # forward-backward error in pixels from which a match counts as lost
 MIN_GAIN = 0.02  # change of exposure that is worth undoing: smaller ones may be those of what moves, and do no harm
-MIN_SIDES = 8, 12  # pixels, shorter and longer side of the smallest pictures that `optical_flow` takes
+MIN_SIDES = 8, 12  # pixels, shorter and longer side of the smallest frames that `optical_flow` takes
 REFINEMENT_STEPS = 10  # fixed-point iterations that refine smooth flow at full size, and SOR iterations in each
 
 
@@ -44,10 +46,28 @@ def _smooth_grey(image: Float[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "H W"
 def optical_flow(
     first: UInt8[np.ndarray, "H W"], second: UInt8[np.ndarray, "H W"], finest_scale: int = 0
 ) -> Float32[np.ndarray, "H W 2"]:
-    """Dense optical flow by inverse search (DIS, arXiv 1603.03590), down to a scale of 1 / 2^`finest_scale`."""
+    """Dense optical flow by inverse search (DIS, arXiv 1603.03590), down to a scale of 1 / 2^`finest_scale`.
+
+    Raises:
+        UserError: the frames are too small.
+    """
+    check_size(*first.shape)
     search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     search.setFinestScale(finest_scale)
     return search.calc(first, second, None)  # type: ignore[call-overload]
+
+
+def check_size(height: int, width: int) -> None:
+    """Refuses frames that are too small for `optical_flow`.
+
+    Raises:
+        UserError: a side is shorter than its entry of `MIN_SIDES`.
+    """
+    if min(height, width) < MIN_SIDES[0] or max(height, width) < MIN_SIDES[1]:
+        raise UserError(
+            f"frames of {width}x{height} pixels are too small for optical flow; "
+            f"expected sides of at least {MIN_SIDES[0]} and {MIN_SIDES[1]} pixels"
+        )
 
 
 def smooth_flow(

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from l2dgs_jax.cameras.flow import MIN_SIDES
+from l2dgs_jax.cameras.flow import check_size
 from l2dgs_jax.cameras.geometry import median_depth
 from l2dgs_jax.config import Config, overrides
 from l2dgs_jax.data.dataset import Dataset, Split
@@ -49,13 +49,11 @@ def resolve(config: Config, dataset: Dataset) -> Config:
         UserError: the frames show nothing or are too small, or the points are behind all cameras.
     """
     split = dataset.train
-    sides = sorted((dataset.width, dataset.height))
-    flow = config.model.tracks or config.model.surfaces or config.inbetweens
-    if flow and any(side < least for side, least in zip(sides, MIN_SIDES, strict=True)):
-        raise UserError(
-            f"{dataset.name}: frames of {dataset.width}x{dataset.height} pixels are too small for optical flow; "
-            f"expected sides of at least {MIN_SIDES[0]} and {MIN_SIDES[1]} pixels, so a smaller --downscale"
-        )
+    if config.model.tracks or config.model.surfaces or config.inbetweens:
+        try:
+            check_size(dataset.height, dataset.width)
+        except UserError as error:
+            raise UserError(f"{dataset.name}: {error}, so a smaller --downscale") from None
     counted = split.valid is None or any(frame.any() for frame in split.valid)
     if not counted or split.mean_level == 0:
         raise UserError(
