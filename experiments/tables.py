@@ -35,6 +35,7 @@ TITLES = {
     "psnr_gain": "PSNR after gain",
     "area": "share of pixels",
 }
+DECIMALS = {"psnr": 1, "ssim": 2, "lpips_alex": 3, "psnr_gain": 1}
 CONVENTION: Convention = "paper"  # for scoring regions with LPIPS; for PSNR and SSIM it is the same as the default
 # Settings of a smoke run; QUICK_STEPS is the number of steps of each stage that a member has.
 QUICK_STEPS = 3
@@ -195,7 +196,8 @@ def _text(scores: float | Sequence[float] | None, measure: str) -> str:
         return "" if measure == "area" else "–"
     if measure == "area":
         return f"{np.mean(scores):.0%}"
-    return markdown.mean_and_spread(scores, 1 if "psnr" in measure else 2)
+    published = np.ndim(scores) == 0  # with two decimals
+    return markdown.mean_and_spread(scores, min(DECIMALS[measure], 2) if published else DECIMALS[measure])
 
 
 def write(options: Options, name: str, members: Sequence[Member], content: Any, text: str) -> None:

@@ -141,6 +141,11 @@ def test_the_share_of_pixels_stands_beside_the_scores_of_a_region():
     ]
 
 
+def test_lpips_has_a_third_decimal_but_for_published_figures():
+    rows = [("ours", [{"dynamic": {"lpips_alex": [0.0314]}}]), ("paper: ours", [{"dynamic": {"lpips_alex": 0.03}}])]
+    assert list(rows_of(tables.table(rows)).values())[2:] == [["0.031"], ["0.03"]]
+
+
 def test_low_light_ends_in_a_mean():
     rows = rows_of(lowlight.markdown(tables.collect(MEMBERS, lowlight.lowlight)))
     flat = "0.50 ± 0.00"
