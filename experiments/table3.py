@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import tyro
 
 from experiments.published import TABLE3
-from experiments.tables import Cells, Options, collect, over_scenes, table, trained, welllit, write
+from experiments.tables import WITH_GAIN, Cells, Options, collect, over_scenes, table, trained, welllit, write
 from l2dgs_jax.runtime import command_line
 
 
@@ -22,7 +22,7 @@ def main(arguments: Sequence[str]) -> None:
 
 
 def markdown(found: dict[str, Cells]) -> str:
-    return table([(name, [cells, TABLE3.get(name, {})]) for name, cells in found.items()])
+    return table([(name, [cells, TABLE3.get(name, {})]) for name, cells in found.items()], WITH_GAIN)
 
 
 if __name__ == "__main__":

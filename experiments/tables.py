@@ -36,6 +36,7 @@ TITLES = {
     "area": "share of pixels",
 }
 DECIMALS = {"psnr": 1, "ssim": 2, "lpips_alex": 3, "psnr_gain": 1}
+WITH_GAIN = (*MEASURES, "psnr_gain")  # PSNR after one gain shows whether an image is only too dark, or wrong
 CONVENTION: Convention = "paper"  # for scoring regions with LPIPS; for PSNR and SSIM it is the same as the default
 # Settings of a smoke run; QUICK_STEPS is the number of steps of each stage that a member has.
 QUICK_STEPS = 3
