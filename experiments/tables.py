@@ -187,7 +187,7 @@ def table(rows: Sequence[tuple[str, Sequence[Cells]]], measures: Sequence[str] =
         shown = []
         for region, measure in columns:
             own, *others = (_text(cells.get(region, {}).get(measure), measure) for cells in parts)
-            shown.append(own + "".join(f" ({other})" for other in others if other))
+            shown.append(own + "".join(f" ({other})" for other in others if measure in MEASURES))
         lines.append([name, *shown])
     return markdown.table_rows(lines)
 

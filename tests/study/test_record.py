@@ -7,8 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from experiments import table1
+from experiments import table1, table3
 from experiments.markdown import percentages
+from experiments.published import TABLE3
 from experiments.quality import compare_poses, table
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.study import spec
@@ -136,6 +137,12 @@ def test_the_documentation_shows_what_was_measured(path):
 def test_the_documentation_shows_what_was_measured_without_training(name, shown):
     pages = [page.read_text() for page in (ROOT / "docs").glob("*.md")]
     assert any(shown(json.loads((RECORD / f"{name}.json").read_text())) in page for page in pages)
+
+
+def test_the_documentation_shows_table_3_as_measured():
+    rows = json.loads((ROOT / "experiments/studies/results/table3.json").read_text())["rows"]
+    assert list(rows) == list(TABLE3)
+    assert table3.markdown(rows) in (ROOT / "docs" / "ablations.md").read_text()
 
 
 def test_the_documentation_shows_table_1_as_measured():
