@@ -12,6 +12,7 @@ import numpy as np
 
 from l2dgs_jax import open_run
 from l2dgs_jax.data.images import to_bytes, write_image
+from l2dgs_jax.data.stacks import evenly_spread
 
 GAP = 6  # pixels
 
@@ -26,8 +27,8 @@ def main() -> None:
     run = open_run(options.run)
     split, renderer = run.dataset.test, run.renderer()
     rows = []
-    for i in np.linspace(0, len(split.names) - 1, options.views + 2).round().astype(int)[1:-1]:
-        images = jax.device_get(renderer(split.camera(int(i)))).images
+    for i in evenly_spread(len(split.names), options.views + 2)[1:-1].tolist():
+        images = jax.device_get(renderer(split.camera(i))).images
         pictures = [to_bytes(x) for x in (split.images[i], images.lowlight, images.welllit)]
         rows.append(np.hstack([np.pad(p, ((0, GAP), (0, GAP), (0, 0)), constant_values=255) for p in pictures]))
     figure = np.vstack(rows)[:-GAP, :-GAP]

@@ -8,10 +8,10 @@ import argparse
 from pathlib import Path
 
 import jax
-import numpy as np
 
 from l2dgs_jax import open_run
 from l2dgs_jax.data.images import encode_jpeg, to_bytes
+from l2dgs_jax.data.stacks import evenly_spread
 from l2dgs_jax.visualize.sheet import sheet
 
 JPEG_QUALITY = 90
@@ -26,7 +26,7 @@ def main() -> None:
 
     runs = {name: open_run(folder) for name, folder in (text.split("=", 1) for text in options.runs)}
     split = next(iter(runs.values())).dataset.test
-    chosen = np.linspace(0, len(split.names) - 1, options.views + 2).round().astype(int)[1:-1].tolist()
+    chosen = evenly_spread(len(split.names), options.views + 2)[1:-1].tolist()
     columns = {"input": [split.images[i] for i in chosen]}
     for name, run in runs.items():
         renderer = run.renderer()
