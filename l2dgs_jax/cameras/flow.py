@@ -6,12 +6,13 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float32, Shaped, UInt8
+from jaxtyping import Bool, Float, Float32, Shaped, UInt8
 
 from l2dgs_jax.errors import UserError
 
 BLUR_SIGMA = 1.0  # standard deviation in pixels of the Gaussian that suppresses noise before matching
 CACHED_FLOWS = 48  # frame pairs whose flow is kept
+INVALID_REACH = 9  # side in pixels of the square around a pixel that is not valid in which flow follows its outline
 LOST = 3.0  # forward-backward error in pixels from which a match counts as lost
 MIN_GAIN = 0.02  # change of exposure that is worth undoing: smaller ones may be those of what moves, and do no harm
 MIN_SIDES = 8, 12  # pixels, shorter and longer side of the smallest frames that `optical_flow` takes
@@ -115,6 +116,11 @@ def relative_gain(first: Shaped[np.ndarray, "*S"], second: Shaped[np.ndarray, "*
     known = (first > 0) & (second > 0)
     gain = np.median(first[known] / second[known]) if known.any() else 1.0
     return float(gain) if abs(gain - 1) > MIN_GAIN else 1.0
+
+
+def surely_valid(valid: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
+    """The valid pixels that have none beside them that is not."""
+    return cv2.erode(valid.astype(np.uint8), np.ones((INVALID_REACH, INVALID_REACH), np.uint8)) > 0
 
 
 def warped(image: UInt8[np.ndarray, "H W"], flow: Float32[np.ndarray, "H W 2"]) -> Float32[np.ndarray, "H W"]:

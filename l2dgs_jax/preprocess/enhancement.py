@@ -45,7 +45,7 @@ def enhanced(dataset: Dataset, method: Enhancement, seed: int = 0) -> Dataset:
 
 def _enhancer(split: Split, method: Enhancement, seed: int) -> Enhancer:
     if method == "zero-dce":
-        net, bend = zero_dce.learn(split.images, seed), jax.jit(zero_dce.brighten)
+        net, bend = zero_dce.learn(split, seed), jax.jit(zero_dce.brighten)
         return lambda image: np.asarray(bend(net, jnp.asarray(image, float)[None])[0])
     exponent = np.float32(brightening_exponent(split.mean_level, MID_GREY))
     if method == "gamma":

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 from tqdm import tqdm
 
+from l2dgs_jax.data.dataset import Split
 from l2dgs_jax.model.networks import apply_conv, init_conv
 from l2dgs_jax.preprocess.lowlight.curve_network import BLOCK, iterate, smoothness_loss, squared_steps, train
 from l2dgs_jax.training.losses import block_means, exposure
@@ -63,26 +64,29 @@ def loss(net: Net, images: Float[Array, "B H W 3"]) -> Scalar:
     )
 
 
-def learn(images: Float[np.ndarray, "F H W 3"], seed: int) -> Net:
-    """Train a network on the pictures of one scene, sRGB values in [0, 1]."""
+def learn(split: Split, seed: int) -> Net:
+    """Train a network on the frames of one scene; pixels that are not valid take on the mean of the others."""
     net = init(jax.random.key(seed))
     rate = Schedule(*(jnp.asarray(value, float) for value in (*RATES, STEPS)))
-    bar = tqdm(_crops(images, seed), total=STEPS, desc="brighten", unit="step", dynamic_ncols=True, disable=None)
+    bar = tqdm(_crops(split, seed), total=STEPS, desc="brighten", unit="step", dynamic_ncols=True, disable=None)
     for net, _ in train(net, iter(bar), rate, loss):  # noqa: B007, B020
         pass
     return net
 
 
-def _crops(images: Float[np.ndarray, "F H W 3"], seed: int) -> Iterator[tuple[Float[Array, "B h w 3"]]]:
+def _crops(split: Split, seed: int) -> Iterator[tuple[Float[Array, "B h w 3"]]]:
     """Batches of random crops of random pictures, half of them mirrored."""
     rng = np.random.default_rng(seed)
-    _, height, width, _ = images.shape
+    frames, height, width, _ = split.images.shape
     rows, columns = min(CROP, height), min(CROP, width)
 
     def crop() -> Float[np.ndarray, "h w 3"]:
-        frame = images[rng.integers(len(images))]
+        frame = rng.integers(frames)
         row, column = rng.integers(height - rows + 1), rng.integers(width - columns + 1)
-        part = frame[row : row + rows, column : column + columns]
+        window = slice(row, row + rows), slice(column, column + columns)
+        part = split.images[frame][window]
+        if split.valid is not None:
+            part = np.where(split.valid[frame][window][..., None], part, split.mean_level)
         return part[:, ::-1] if rng.random() < 0.5 else part
 
     for _ in range(STEPS):

@@ -20,6 +20,7 @@ MIN_SEEN = 3  # of these, in which a surface must be seen
 REACH = 9  # side in pixels of the square around a track in which static surfaces may be hidden
 BLUR_SIGMA = 1.0  # standard deviation in pixels of the Gaussian that suppresses noise
 DARKNESS = 0.3  # of the median light; darker colours are mostly noise, and count as this
+LEAST_LIGHT = 1e-4  # linear, a third of the first 8-bit level of sRGB: the median may be 0
 SHADE = 0.35, 1.1  # light in a shadow over that outside, at least and at most
 TINT = 0.15  # difference in log-light of a channel from the mean of all channels: a shadow changes colours little
 
@@ -113,7 +114,7 @@ def _colors(
 
 def _alike(here: Float32[np.ndarray, "N 3"], elsewhere: Float32[np.ndarray, "N 3"]) -> Bool[np.ndarray, " N"]:
     """Whether light is that of the same surface, or of its shadow."""
-    least = DARKNESS * np.median(elsewhere)
+    least = max(DARKNESS * np.median(elsewhere), LEAST_LIGHT)
     change = np.log(np.maximum(here, least) / np.maximum(elsewhere, least))
     mean = change.mean(-1)
     tint = np.abs(change - mean[:, None]).max(-1)

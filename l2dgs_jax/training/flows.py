@@ -2,11 +2,18 @@
 
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, Float16, Float32, Int, UInt8
 
-from l2dgs_jax.cameras.flow import brightened, equally_exposed, match, optical_flow, smooth_flow, warped
+from l2dgs_jax.cameras.flow import (
+    brightened,
+    equally_exposed,
+    match,
+    optical_flow,
+    smooth_flow,
+    surely_valid,
+    warped,
+)
 from l2dgs_jax.cameras.geometry import camera_centres
 from l2dgs_jax.cameras.jumps import follow_jumps, unexplained
 from l2dgs_jax.data.dataset import Split
@@ -19,7 +26,6 @@ SMOOTH_FLOW_SIZES = 0.5, 0.25, 0.125  # of downscaled frames, in which smooth fl
 # between are not harmed: there, pixels that are wrong are found out.
 MIN_JUMP = 7.0
 MAX_FORWARD_BACKWARD_ERROR = 1.5  # pixels; flow of a larger error is not trusted
-INVALID_REACH = 9  # side in pixels of the square around a pixel that is not valid in which flow follows its outline
 MAX_UNEXPLAINED = 0.8  # share of a frame's variance that warping the other may leave; more means a cut between them
 
 
@@ -52,9 +58,12 @@ def neighbour_flows(split: Split, *, filled: bool = False) -> Flows:
         for size in SMOOTH_FLOW_SIZES if filled else ():
             smooth = _consistent(smooth_flow(first, second, size), smooth_flow(second, first, size))
             found = np.where(np.isfinite(found), found, smooth)
-        trusted = np.full(found.shape[:3], _explains(first, second, found[0]) and _explains(second, first, found[1]))
+        valid = np.ones(found.shape[:3], bool)
         if split.valid is not None:
-            trusted &= np.stack([_surely_valid(split.valid[index]) for index in (frame, following[frame])])
+            valid = np.stack([surely_valid(split.valid[index]) for index in (frame, following[frame])])
+        trusted = valid & (
+            _explains(first, second, found[0], valid[0]) and _explains(second, first, found[1], valid[1])
+        )
         return np.where(trusted[..., None], found, np.float32(np.nan)).astype(np.float16)
 
     frames = range(len(greys))
@@ -95,11 +104,6 @@ def _with_jumps(
     return np.where((np.stack(either) & np.stack(explained))[..., None], with_jumps, found)
 
 
-def _surely_valid(valid: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
-    """The valid pixels that have none beside them that is not."""
-    return cv2.erode(valid.astype(np.uint8), np.ones((INVALID_REACH, INVALID_REACH), np.uint8)) > 0
-
-
 def _seen_from(flow: Float32[np.ndarray, "H W 2"], mask: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
     """The mask of a frame, at the pixels of the frame from which the flow leads to it."""
     return warped(mask.astype(np.uint8), flow) > 0.5
@@ -115,12 +119,18 @@ def _consistent(
 
 
 def _explains(
-    first: UInt8[np.ndarray, "H W"], second: UInt8[np.ndarray, "H W"], flow: Float32[np.ndarray, "H W 2"]
+    first: UInt8[np.ndarray, "H W"],
+    second: UInt8[np.ndarray, "H W"],
+    flow: Float32[np.ndarray, "H W 2"],
+    valid: Bool[np.ndarray, "H W"],
 ) -> bool:
-    """Whether the second frame, warped by the flow, predicts the first well enough for both to show the same scene.
+    """Whether the second frame, warped by the flow, predicts the first where valid well enough to show the same scene.
 
     Forward-backward errors do not tell: smooth flow is consistent between any two frames, even across a cut.
     """
-    known = np.isfinite(flow[..., 0])
-    residual = first - np.where(known, warped(second, np.nan_to_num(flow)), first.mean())
-    return bool(known.any() and np.square(residual).mean() <= MAX_UNEXPLAINED * first.var())
+    known = np.isfinite(flow[valid][:, 0])
+    if not known.any():
+        return False
+    actual, predicted = first[valid], warped(second, np.nan_to_num(flow))[valid]
+    residual = actual - np.where(known, predicted, actual.mean())
+    return bool(np.square(residual).mean() <= MAX_UNEXPLAINED * actual.var())

@@ -91,6 +91,7 @@ def resolve(config: Config, dataset: Dataset) -> Config:
         model = dataclasses.replace(model, initial_exponents=(round(exponent, 3), model.initial_exponents[1]))
     if model.initial_illumination == "auto":
         b2 = model.initial_exponents[1] if model.initial_exponents else networks.EXPONENT_CENTRE
+        b2 = 1.0 if model.unit_exponent == "b2" else b2
         model = dataclasses.replace(model, initial_illumination=round(gain ** (1 / b2), 3))
     return dataclasses.replace(config, model=model)
 

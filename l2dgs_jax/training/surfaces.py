@@ -19,7 +19,7 @@ from l2dgs_jax.cameras.epipolar import (
     project,
     proposed,
 )
-from l2dgs_jax.cameras.flow import brightened, matcher, pixel_indices
+from l2dgs_jax.cameras.flow import brightened, matcher, pixel_indices, surely_valid
 from l2dgs_jax.cameras.geometry import camera_centres, pixel_rays, points_inside
 from l2dgs_jax.data.dataset import Split
 from l2dgs_jax.data.stacks import evenly_spread
@@ -95,7 +95,7 @@ def depth_maps(points: Float[np.ndarray, "P 3"], split: Split) -> list[DepthMap]
         bounds = INVERSE_DEPTH_RANGE[0] / farthest, INVERSE_DEPTH_RANGE[1] / nearest
         inverse = triangulated(geometry, ends, errors < MAX_FORWARD_BACKWARD_ERROR, bounds)
         if split.valid is not None:
-            inverse[~split.valid[frame]] = np.nan
+            inverse[~surely_valid(split.valid[frame])] = np.nan
         return DepthMap(viewmat, K, inverse)
 
     frames = evenly_spread(len(greys), MAX_FRAMES)

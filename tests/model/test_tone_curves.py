@@ -91,6 +91,13 @@ def test_the_equalising_law_is_recovered_from_the_frames():
     np.testing.assert_allclose(tone_curves.equalising_law(LAW.gain * lit**LAW.exponent, valid), LAW, rtol=0.05)
 
 
+def test_the_equalising_law_of_more_pixels_than_a_float_counts_is_finite():
+    frames = np.broadcast_to(np.float16(0.1), (1, 2**12, 2**12 + 4, 3))
+    with jax.enable_x64(False):
+        law = tone_curves.equalising_law(frames, None)
+    assert np.isfinite(law).all()
+
+
 @pytest.mark.parametrize("level", [0.0, 0.2])
 def test_frames_of_one_value_have_a_finite_law(level):
     law = tone_curves.equalising_law(np.full((2, 4, 4, 3), level), None)

@@ -113,3 +113,8 @@ def test_less_light_brings_pixels_to_the_exposure_and_keeps_the_ratios_of_their_
 def test_less_light_leaves_dark_and_saturated_pixels_unchanged():
     assert darkening.light_factor(picture(high=0.05).reshape(-1, 1, 3), 0.1) == 1
     assert darkening.light_factor(np.ones((5, 1, 3), np.float32), 0.1) == 1
+
+
+def test_no_pixels_have_no_lightness():
+    assert darkening.lightness(np.zeros((0, 1, 3), np.float32)).shape == (0, 1)
+    assert darkening.light_factor(np.zeros((0, 1, 3), np.float32), 0.1) == 1

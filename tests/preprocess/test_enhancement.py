@@ -35,6 +35,18 @@ def test_training_frames_are_brightened_and_held_out_ones_unchanged(dataset, met
     assert enhanced(dataset, "none") is dataset
 
 
+def test_zero_dce_learns_nothing_from_pixels_that_are_not_valid(dataset, monkeypatch):
+    monkeypatch.setattr(zero_dce, "STEPS", 2)
+    split = dataset.train
+    valid = np.ones(split.images.shape[:3], bool)
+    valid[:, :, :5] = False
+    nets = []
+    for fill in (0, 1):
+        images = np.where(valid[..., None], split.images, fill).astype(split.images.dtype)
+        nets.append(zero_dce.learn(dataclasses.replace(split, images=images, valid=valid), 0))
+    jax.tree.map(np.testing.assert_array_equal, *nets)
+
+
 def test_gamma_brings_uniform_frames_to_mid_grey(dataset):
     flat = dataclasses.replace(dataset.train, images=np.full_like(dataset.train.images, 0.05))
     images = enhanced(dataclasses.replace(dataset, train=flat), "gamma").train.images

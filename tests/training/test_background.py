@@ -82,6 +82,14 @@ def test_pixels_that_are_not_valid_do_not_tell():
     assert shares["shadow"] == 0
 
 
+def test_black_is_like_black():
+    split, tracks = seen()
+    black = dataclasses.replace(split, images=np.zeros_like(split.images))
+    looks = likeness_to_background(tracks.frames, tracks.pixels, black, backdrop(split), tracks)
+    assert looks.alike.all()
+    assert not looks.differs.any()
+
+
 @pytest.mark.parametrize("frames", [5, 1000])
 def test_a_few_frames_tell_what_the_background_looks_like(frames, monkeypatch):
     monkeypatch.setattr(background, "MAX_FRAMES", frames)

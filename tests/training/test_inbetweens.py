@@ -249,3 +249,14 @@ def test_pixels_that_are_not_valid_do_not_make_a_cut(split):
     flows = neighbour_flows(dataclasses.replace(split, images=images, valid=valid))
     np.testing.assert_array_equal(flows.following, [4, 3, 2, 0, 2])
     assert np.isnan(flows.displacements[:, :, :, :8]).all()
+
+
+def test_a_cut_is_found_inside_a_border_that_is_not_valid():
+    """A border is the same in all frames, so that flow seems to explain much of them."""
+    noise = np.random.default_rng(0).uniform(0, 0.3, (FRAMES, HEIGHT, WIDTH, 3))
+    valid = np.ones(noise.shape[:3], bool)
+    valid[:, :6] = valid[:, -6:] = valid[:, :, :6] = valid[:, :, -6:] = False
+    cameras = Camera(*(x[:FRAMES] for x in make_dataset().train.cameras))
+    images = np.where(valid[..., None], noise, 0).astype(np.float16)
+    flows = neighbour_flows(Split(tuple("abcde"), cameras, images, valid=valid), filled=True)
+    np.testing.assert_array_equal(flows.following, range(FRAMES))

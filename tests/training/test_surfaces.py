@@ -105,6 +105,18 @@ def test_invalid_pixels_get_no_points():
     assert np.mean(pixels[:, 0] < WIDTH / 2 - 30) < 0.05
 
 
+def test_the_outline_of_what_is_valid_gives_no_points():
+    """Where a camera circles a thing, what stays at its place in the picture looks like something at its depth."""
+    split, _ = filmed()
+    row, column = np.ogrid[:HEIGHT, :WIDTH]
+    lens = np.hypot(row - HEIGHT / 2, column - WIDTH / 2) < 0.45 * HEIGHT
+    valid = np.broadcast_to(lens, split.images.shape[:3]).copy()
+    images = np.where(lens[..., None], split.images, 0).astype(np.float16)
+    points = find_surfaces(sparse(), dataclasses.replace(split, images=images, valid=valid), MANY)
+    assert len(points) > 1000
+    assert np.mean(distance_to_surfaces(points) > 0.15) < 0.12  # 0.04 if the same pixels are valid but none is black
+
+
 @pytest.mark.parametrize("turned", [0.0, 0.05])
 def test_cameras_in_one_place_give_no_points(turned):
     split, _ = filmed(block=False)

@@ -14,8 +14,9 @@ from l2dgs_jax.config import DensityConfig, overrides
 from l2dgs_jax.config.settings import RATE_GROUPS
 from l2dgs_jax.model import hexplane
 from l2dgs_jax.runtime import devices
-from l2dgs_jax.training import engine, initial_state, losses, objective
+from l2dgs_jax.training import engine, initial_state, losses, objective, resolve
 from l2dgs_jax.training.batching import view_indices
+from l2dgs_jax.training.initial_state import split_darkening
 from l2dgs_jax.training.parameter_groups import groups
 from l2dgs_jax.training.state import StepReport
 from l2dgs_jax.training.step import cooldown, train_step
@@ -333,3 +334,11 @@ def test_reflectances_stay_in_0_to_1_only_if_bounded(dataset, bounded):
     reflectance = state.scene.params.gaussians.reflectance
     assert bool(jnp.all((reflectance >= 0) & (reflectance <= 1))) is bounded
     assert bool(jnp.isfinite(reflectance).all())
+
+
+@pytest.mark.parametrize(("unit_exponent", "b2"), [(None, 9.0), ("b1", 9.0), ("b2", 1.0)])
+def test_the_initial_illumination_darkens_as_much_as_the_frames(dataset, unit_exponent, b2):
+    config = config_of(**{"model.initial_illumination": "auto", "model.unit_exponent": unit_exponent})
+    resolved = resolve(config, dataset)
+    gain = split_darkening(dataset.train, resolved).gain
+    assert resolved.model.initial_illumination**b2 == pytest.approx(gain, rel=0.02)

@@ -51,6 +51,8 @@ def lightness(image: Image, order: LabOrder = "correct") -> Plane:
         image: sRGB values in [0, 1].
         order: "lednet" swaps red and blue, as LEDNet's script does.
     """
+    if not image.size:
+        return np.zeros(image.shape[:2], np.float32)  # OpenCV refuses empty images
     code = cv2.COLOR_RGB2LAB if order == "correct" else cv2.COLOR_BGR2LAB
     return np.clip(cv2.cvtColor(image, code)[..., 0] / 100, 0, 1)
 
