@@ -127,7 +127,7 @@ def make_page(options: Page) -> None:
 def _media(folder: Path) -> dict[str, dict[str, Path]]:
     """The files by method and scene."""
     methods = sorted(path for path in folder.glob("*") if path.is_dir())
-    files = {m.name: {p.stem: p for p in sorted(m.iterdir()) if p.suffix.lower() in SUFFIXES} for m in methods}
+    files = {method.name: _scenes(method) for method in methods}
     if len(files.keys() - {INPUT}) < 2:
         raise UserError(f"{folder}: expected folders of at least two methods, METHOD/SCENE.mp4")
     scenes = set.union(*map(set, files.values()))
@@ -136,6 +136,15 @@ def _media(folder: Path) -> dict[str, dict[str, Path]]:
             raise UserError(f"{folder / name}: has no {min(scenes - found.keys())}; expected every scene of the others")
     if not scenes:
         raise UserError(f"{folder}: its folders hold no pictures or videos; expected {', '.join(SUFFIXES)}")
+    return files
+
+
+def _scenes(method: Path) -> dict[str, Path]:
+    """A method's files by scene."""
+    files: dict[str, Path] = {}
+    for path in sorted(path for path in method.iterdir() if path.suffix.lower() in SUFFIXES):
+        if files.setdefault(path.stem, path) != path:
+            raise UserError(f"{path}: is there beside {files[path.stem].name}; expected one file per scene")
     return files
 
 
@@ -192,7 +201,7 @@ def _counts(key: dict[str, Any], path: Path, content: dict[str, Any]) -> tuple[n
                 rated[methods.index(dealt[letter]), criterion] += rating
                 ratings[methods.index(dealt[letter]), criterion] += 1
         assert isinstance(content["participant"], str)
-    except (KeyError, TypeError, ValueError, IndexError, AssertionError):
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError, AssertionError):
         raise UserError(f"{path}: holds answers that the page does not offer; expected a file that it left") from None
     return chosen, choices, rated, ratings
 

@@ -85,17 +85,19 @@ def write(dataset: Dataset, folder: Path) -> None:
         UserError: the folder holds files already or cannot be written.
     """
     cameras: dict[ModelCamera, int] = {}
-    images = []
+    images: dict[str, ModelImage] = {}  # a frame may be held out and trained on
     for split in (dataset.train, dataset.test):
         for name, viewmat, K in zip(split.names, split.cameras.viewmat, split.cameras.K, strict=True):
             params = tuple(float(K[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
             camera = ModelCamera("PINHOLE", dataset.width, dataset.height, params)
             number = cameras.setdefault(camera, len(cameras) + 1)
-            images.append(ModelImage(f"{name}.png", np.asarray(viewmat, np.float64), number))
+            images[name] = ModelImage(f"{name}.png", np.asarray(viewmat, np.float64), number)
     with new_folder(folder) as target:
         write_pictures(dataset, target / "images", target)
         write_lists(dataset, target)
-        colmap_model.write_model(target / "sparse" / "0", list(cameras), images, dataset.points, dataset.colors)
+        colmap_model.write_model(
+            target / "sparse" / "0", list(cameras), list(images.values()), dataset.points, dataset.colors
+        )
 
 
 def pinhole_and_lens(camera: ModelCamera) -> tuple[Float64[np.ndarray, "3 3"], Lens]:

@@ -73,7 +73,9 @@ def _read(
         pixels = file.read_image(oiio.FLOAT)
         if pixels is None:
             raise UserError(f"{path}: expected a readable picture, but it is damaged ({_reason(file.geterror())})")
-        may_be_associated = file.format_name() in ("openexr", "tiff")
+        kind = file.format_name()
+    if kind == "jpeg" and not _is_whole_jpeg(path.read_bytes()):  # what is missing would be grey
+        raise UserError(f"{path}: expected a readable picture, but its end is missing")
     pixels = _upright(np.asarray(pixels, np.float32), _orientation(spec) if upright else 1)
     if _is_float(spec) and not np.isfinite(pixels).all():
         raise UserError(f"{path}: holds NaN or infinite values; expected finite colours")
@@ -82,7 +84,7 @@ def _read(
     return (
         np.ascontiguousarray(color),
         None if channel < 0 else np.ascontiguousarray(pixels[..., channel : channel + 1]),
-        may_be_associated and not spec.getattribute("oiio:UnassociatedAlpha"),
+        kind in ("openexr", "tiff") and not spec.getattribute("oiio:UnassociatedAlpha"),
         _is_linear(spec),
     )
 
@@ -155,6 +157,14 @@ def _open(path: Path) -> oiio.ImageInput:
     if file is None:
         raise UserError(f"{path}: expected a readable picture ({_reason(oiio.geterror())})")
     return file
+
+
+def _is_whole_jpeg(content: bytes) -> bool:
+    """Whether the end of a JPEG picture follows its first scan; a thumbnail in its header has an end of its own."""
+    at, scan, end = 2, 0xDA, b"\xff\xd9"
+    while content[at : at + 1] == b"\xff" and at + 4 <= len(content) and content[at + 1] != scan:
+        at += 2 + int.from_bytes(content[at + 2 : at + 4], "big")
+    return end in content[at:]
 
 
 def _orientation(spec: oiio.ImageSpec) -> int:

@@ -1,7 +1,7 @@
 """The layout of LLFF (arXiv 1905.00889): `poses_bounds.npy` beside the pictures.
 
     poses_bounds.npy   [F, 17]: pose [3, 5] (axes down, right, back; position; height, width, focal length), near, far
-    images/<name>, in the order of their names   [images_<k>/<name>, k times smaller]
+    images/<name>, in the order of their names with suffix   [images_<k>/<name>, k times smaller]
     [a point cloud, see `clouds.find`, or else COLMAP's sparse/]
     [dataset.json]   [metadata.json]   as in the layout of Nerfies
 
@@ -50,7 +50,7 @@ def read(folder: Path, downscale: int, held_out: str, frame_memory: float) -> Da
         raise UserError(f"{path}: the array has shape {rows.shape}; expected (F, 17)")
     if not root.is_dir():
         raise UserError(f"{root}: no such folder; expected the scene's pictures")
-    names = sorted(by_name(root))
+    names = list(by_name(root))
     if len(names) != len(rows):
         raise UserError(f"{path}: has {len(rows)} poses for the {len(names)} pictures in {root}; expected one each")
     train, test, notes = splits.hold_out(str(path), names, splits.lists_beside(folder, names), held_out, default="8")
@@ -96,7 +96,8 @@ def write(dataset: Dataset, folder: Path) -> None:
     with new_folder(folder) as target:
         write_pictures(dataset, target / "images", target)
         write_lists(dataset, target)
-        np.save(target / POSES_FILE, np.stack([rows[name] for name in sorted(rows)]))
+        in_order = sorted(rows, key=lambda name: Path(f"{name}.png"))  # as `by_name` finds the pictures
+        np.save(target / POSES_FILE, np.stack([rows[name] for name in in_order]))
         clouds.write_ply(target / clouds.CLOUD_FILES[0], dataset.points, dataset.colors)
 
 

@@ -1,7 +1,8 @@
 """Finding the files of the pictures of a scene's frames."""
 
+import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -81,7 +82,7 @@ def copies(scene: Path, root: Path, downscale: int, files: Mapping[str, str], in
     if in_order and scale > 1 and not found.keys() & files.keys():
         originals = by_name(root)
         if len(originals) == len(found):
-            found = dict(zip(sorted(originals), (found[name] for name in sorted(found)), strict=True))
+            found = dict(zip(originals, found.values(), strict=True))
     missing = [name for name in files if name not in found]
     if missing:
         raise UserError(
@@ -92,14 +93,24 @@ def copies(scene: Path, root: Path, downscale: int, files: Mapping[str, str], in
 
 
 def by_name(folder: Path, suffixes: Sequence[str] = SUFFIXES) -> dict[str, list[Path]]:
-    """Picture files, or files with other `suffixes`, by their path in the folder without suffix; none hidden."""
+    """Picture files, or files with other `suffixes`, by their path in the folder without suffix; none hidden.
+
+    They are in the order of their paths with suffix.
+    """
     files: dict[str, list[Path]] = {}
-    for path in sorted(folder.rglob("*")):
-        inside = path.relative_to(folder)
-        hidden = any(part.startswith(".") for part in inside.parts)  # such as what macOS writes beside files
-        if path.suffix.lower() in suffixes and not hidden:
-            files.setdefault(inside.with_suffix("").as_posix(), []).append(path)
+    for path in sorted(_visible(folder)):
+        if path.suffix.lower() in suffixes:
+            files.setdefault(path.relative_to(folder).with_suffix("").as_posix(), []).append(path)
     return files
+
+
+def _visible(folder: Path) -> Iterator[Path]:
+    """All files in a folder that are not hidden, such as what macOS writes beside files; links are followed."""
+    for top, folders, files in os.walk(folder, followlinks=True):
+        place = Path(top)
+        leads_back = lambda name, place=place: place.resolve().is_relative_to((place / name).resolve())
+        folders[:] = [name for name in folders if not name.startswith(".") and not leads_back(name)]
+        yield from (place / name for name in files if not name.startswith("."))
 
 
 def only(files: Sequence[Path], meant: Path | None = None) -> Path:

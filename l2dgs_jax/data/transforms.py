@@ -80,7 +80,7 @@ def write(dataset: Dataset, folder: Path) -> None:
             cannot be written.
     """
     files: dict[str, list[str]] = {"train": [], "val": []}
-    frames = []
+    frames: dict[str, dict[str, Any]] = {}  # a frame may be held out and trained on
     for part, split in (("train", dataset.train), ("val", dataset.test)):
         if split.valid is not None:
             raise UserError("--to transforms: some pixels of the scene are not valid; expected nerfies, colmap or llff")
@@ -89,7 +89,7 @@ def write(dataset: Dataset, folder: Path) -> None:
             world = np.linalg.inv(np.asarray(viewmat, np.float64)) @ OPENGL_AXES
             intrinsics = dict(zip(("fl_x", "fl_y", "cx", "cy"), map(float, (K[0, 0], K[1, 1], *K[:2, 2])), strict=True))
             entry = {"file_path": files[part][-1], "time": float(time), "transform_matrix": world.tolist()}
-            frames.append(entry | intrinsics)
+            frames[name] = entry | intrinsics
     content = {
         "camera_model": "OPENCV",
         "w": dataset.width,
@@ -98,7 +98,7 @@ def write(dataset: Dataset, folder: Path) -> None:
         "train_filenames": files["train"],
         "val_filenames": files["val"],
         "test_filenames": files["val"],
-        "frames": sorted(frames, key=lambda frame: frame["file_path"]),
+        "frames": sorted(frames.values(), key=lambda frame: frame["file_path"]),
     }
     with new_folder(folder) as target:
         write_pictures(dataset, target / "images", target)
@@ -130,7 +130,7 @@ def _entries(folder: Path) -> tuple[dict[str, Entry], Lists, str | None]:
         content = read_json(single, "the frames")
         entries = _listed(single, content)
         parts = [
-            next((name_list(single, content, key) for key in keys if key in content), [])
+            next(filter(None, (name_list(single, content, key) for key in keys if key in content)), [])
             for keys in (("train_filenames",), ("test_filenames", "val_filenames"))
         ]
         train, test = ([_name(folder, _picture(single, file)) for file in files] for files in parts)
@@ -138,6 +138,7 @@ def _entries(folder: Path) -> tuple[dict[str, Entry], Lists, str | None]:
         if unknown:
             raise UserError(f"{single}: lists '{unknown[0]}', which is not among its frames; expected one of them")
         ply = value(single, content, "ply_file_path", str) if content.get("ply_file_path") else None
+        train = train or [name for name in entries if name not in test]
         return entries, (train, test) if train and test else NO_LISTS, ply
     lists: list[list[str]] = []
     entries = {}

@@ -11,7 +11,7 @@ from l2dgs_jax.errors import UserError
 from l2dgs_jax.runs import checkpoints
 from l2dgs_jax.runs.checkpoints import Checkpoint
 from l2dgs_jax.runs.run import Run
-from l2dgs_jax.runtime.files import is_taken, make_folder, write_json
+from l2dgs_jax.runtime.files import make_folder, new_folder, write_json
 from l2dgs_jax.training import initial_state
 
 SETTINGS = "config.json"
@@ -94,10 +94,9 @@ def save_run(run: Run, folder: str | Path) -> Run:
     folder = Path(folder)
     if run.dataset.source is None:
         raise UserError(f"{run.name}: was not read from a scene; expected a data set that load_dataset returned")
-    if is_taken(folder):
-        raise UserError(f"{folder}: already holds another run or files; expected a new folder")
-    write_settings(folder, run.dataset.source.scene, run.config)
-    checkpoints.save(folder / CHECKPOINT, Checkpoint(run.state), run.config)
+    with new_folder(folder) as place:
+        write_settings(place, run.dataset.source.scene, run.config)
+        checkpoints.save(place / CHECKPOINT, Checkpoint(run.state), run.config)
     return dataclasses.replace(run, folder=folder)
 
 

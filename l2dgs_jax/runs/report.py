@@ -57,7 +57,7 @@ class Report:
         elif event == "end":
             self.shown |= {"running": False, "state": facts.get("reason", "finished"), "left": None}
         if event not in ("step", "metrics") or time.monotonic() >= self.due:
-            with contextlib.suppress(UserError, OSError):
+            with contextlib.suppress(UserError, OSError, UnicodeError):
                 self.write()
             self.due = time.monotonic() + WRITE_INTERVAL
 

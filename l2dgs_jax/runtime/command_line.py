@@ -50,6 +50,11 @@ def run(
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(error.code)
+    except OSError as error:
+        if error.filename is None:
+            raise
+        print(f"error: {error.filename}: {error.strerror}; expected a path that can be reached", file=sys.stderr)
+        sys.exit(2)
     except Interrupted as stop:
         print(stop, file=sys.stderr)
         sys.exit(stop.code)

@@ -96,7 +96,7 @@ def new_folder(path: Path) -> Iterator[Path]:
         UserError: `path` exists and is not an empty folder, or cannot be written.
     """
     expect_new(path)
-    target = path.absolute()
+    target = path.resolve()
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(
@@ -154,5 +154,5 @@ def expect_new(path: Path) -> None:
     Raises:
         UserError: `path` exists and is not an empty folder.
     """
-    if path.is_symlink() or is_taken(path):
+    if is_taken(path):
         raise UserError(f"{path}: exists already; expected a new or an empty folder to write to")

@@ -1,6 +1,7 @@
 """The TOML file that describes a study, and the members that it defines."""
 
 import itertools
+import os
 import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -109,7 +110,7 @@ def _list(path: Path, content: dict[str, Any], key: str, kind: type) -> list:
 
 
 def _scene(path: Path, scene: str) -> str:
-    return scene if scene == "demo" else str((path.parent / Path(scene).expanduser()).absolute())
+    return scene if scene == "demo" else str((path.parent / os.path.expanduser(scene)).absolute())
 
 
 def _check_different(path: Path, scenes: Sequence[str]) -> None:

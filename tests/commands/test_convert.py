@@ -114,6 +114,14 @@ def test_instants_truth_and_masks_of_part_of_a_scene_are_read_back(tmp_path, lay
     assert_same(data.load_dataset(tmp_path / "again"), subset)
 
 
+@pytest.mark.parametrize("layout", data.LAYOUTS)
+def test_frames_that_are_also_held_out_are_read_back(tmp_path, layout):
+    dataset = data.load_dataset(write_nerfies(tmp_path / "scene"))
+    shared = dataclasses.replace(dataset, test=dataset.train)
+    data.LAYOUTS[layout].write(shared, tmp_path / "copy")
+    assert_same(data.load_dataset(tmp_path / "copy"), shared)
+
+
 @pytest.mark.parametrize("layout", ["nerfies", "colmap", "llff"])
 def test_invalid_pixels_are_read_back(tmp_path, layout):
     dataset = data.load_dataset(write_nerfies(tmp_path / "scene"))
@@ -210,6 +218,7 @@ def test_a_mistake_on_the_command_line_is_reported_in_one_sentence(tmp_path, cap
     monkeypatch.setattr(command_line, "use_compilation_cache", lambda: None)
     for arguments, message in (
         ([str(tmp_path / "none"), str(tmp_path / "out"), "--to", "llff"], "none: no such folder"),
+        (["demo", str(tmp_path / ("x" * 300)), "--to", "llff"], "File name too long"),
         (["demo", str(tmp_path), "--to", "llff", "--downscale", "0"], "--downscale 0: expected"),
         (["demo", str(tmp_path), "--to", "llff", "--format", "colmap"], "sparse/0: no such model"),
     ):

@@ -38,6 +38,8 @@ def test_the_numbers_of_presets_are_in_range(preset):
         ("model.sh_degree", [-1, 4], [0, 3]),
         ("model.tone", [1.0, 10.0], [1.01, "gain"]),
         ("model.initial_exponents", [(1.0, 9.0), ("auto", 10.0)], [("auto", 9.0), None]),
+        ("frame_memory", [float("inf"), float("nan")], [0.0]),
+        ("density.grad_threshold", [float("inf"), float("nan")], [0.0]),
     ],
 )
 def test_numbers_out_of_range_are_refused(name, wrong, right):

@@ -181,6 +181,18 @@ def test_pictures_of_upright_cameras_are_turned(scene):
     assert np.array_equal(data.load_dataset(scene).train.images, expected)
 
 
+def test_pictures_in_linked_folders_are_found(scene, tmp_path):
+    expected = data.load_dataset(scene).train.images
+    (scene / "images").rename(tmp_path / "elsewhere")
+    (scene / "images").mkdir()
+    (scene / "images" / "camera").symlink_to(tmp_path / "elsewhere")
+    (tmp_path / "elsewhere" / "back").symlink_to(scene / "images")
+    assert sorted(by_name(scene / "images"))[0] == "camera/000000"
+    (scene / "images" / "camera").rename(scene / "frames")
+    (scene / "images").rmdir()
+    assert np.array_equal(data.load_dataset(scene).train.images, expected)
+
+
 def test_hidden_files_are_no_pictures(scene):
     expected = data.load_dataset(scene).train.images
     (scene / "images" / "._000000.png").write_bytes(b"made by another program")

@@ -61,6 +61,21 @@ def test_linear_frames_are_mentioned_once(tmp_path):
     assert data.load_dataset(scene).notes == (assembly.LINEAR_NOTE,)
 
 
+@pytest.mark.parametrize("progressive", [0, 1])
+def test_a_jpeg_without_its_end_is_refused_but_not_one_with_more_behind_it(tmp_path, progressive):
+    pixels = np.random.default_rng(0).integers(0, 256, (40, 60, 3), np.uint8)
+    whole = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_PROGRESSIVE, progressive])[1].tobytes()
+    thumbnail = b"\xff\xe1" + (len(whole) + 2).to_bytes(2, "big") + whole  # a segment that holds a whole picture
+    whole = whole[:2] + thumbnail + whole[2:]
+    path = tmp_path / "a.jpg"
+    path.write_bytes(whole + b"\xff\xda and a film, as some phones append it")
+    np.testing.assert_allclose(images.read_image(path).mean(), 0.5, atol=0.03)
+    for part in (0.99, 0.8):
+        path.write_bytes(whole[: int(part * len(whole))])
+        with pytest.raises(UserError, match=r"a\.jpg: expected a readable picture"):
+            images.read_image(path)
+
+
 def test_values_that_are_not_finite_are_refused(tmp_path):
     pixels = np.zeros((4, 5, 3), np.float32)
     pixels[1, 2] = np.nan

@@ -92,6 +92,19 @@ def test_a_fault_is_named_in_one_sentence(scene, fault):
     assert "\n" not in str(caught.value)
 
 
+def test_poses_belong_to_the_pictures_in_the_order_of_their_files(scene):
+    """As COLMAP and LLFF sort them: with their suffix, so that a space comes before a dot."""
+    expected = data.load_dataset(scene).train
+    for old, new in (("000001", "b (1)"), ("000002", "b (2)"), ("000003", "b")):
+        (scene / "images" / f"{old}.png").rename(scene / "images" / f"{new}.png")
+    for i in (0, 4, 5, 6, 7, 8):
+        (scene / "images" / f"{i:06d}.png").rename(scene / "images" / f"{'a' if i < 1 else 'c'}{i}.png")
+    found = data.load_dataset(scene).train
+    assert found.names[:3] == ("b (1)", "b (2)", "b")
+    np.testing.assert_array_equal(found.images, expected.images)
+    np.testing.assert_array_equal(found.cameras.viewmat, expected.cameras.viewmat)
+
+
 def test_smaller_copies_that_are_numbered_belong_to_the_pictures_in_order(scene):
     for i in range(9):
         write_image(scene / "images_2" / f"image{i:03d}.png", np.full((12, 16, 3), i / 10))

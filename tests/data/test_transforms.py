@@ -134,6 +134,11 @@ def test_the_lists_of_a_nerfstudio_scene_are_used(studio):
     dataset = data.load_dataset(studio)
     assert (dataset.train.names, dataset.test.names) == (("000001", "000002"), ("000005",))
     assert data.load_dataset(studio, held_out="3").test.names == ("000000", "000003", "000006")
+    edit_json(studio / "transforms.json", test_filenames=[])
+    assert data.load_dataset(studio).test.names == ("000005",)
+    edit_json(studio / "transforms.json", train_filenames=None)
+    assert data.load_dataset(studio).test.names == ("000005",)
+    assert len(data.load_dataset(studio).train.names) == 8
 
 
 def test_smaller_copies_of_the_pictures_are_used(studio):

@@ -74,6 +74,7 @@ def test_the_table_has_the_form_of_table_2(tmp_path):
         ({"answers": [answer("Scene 1", 0, A=6)]}, "does not offer"),
         ({"answers": [answer("Scene 1", 0, A=2.5)]}, "does not offer"),
         ({"answers": 3}, "does not offer"),
+        ({"answers": [{**answer("Scene 1", 0), "ratings": [1, 2]}]}, "does not offer"),
         ({"participant": None}, "does not offer"),
     ],
 )
@@ -146,6 +147,7 @@ def test_malformed_keys_and_answers_are_refused(tmp_path, change):
     [
         (lambda folder: shutil.rmtree(folder / "theirs"), "two methods"),
         (lambda folder: (folder / "theirs" / "otter.png").unlink(), "has no otter"),
+        (lambda folder: shutil.copy(folder / "theirs" / "otter.png", folder / "theirs" / "otter.jpg"), "one file per"),
         (lambda folder: [path.rename(path.with_suffix(".txt")) for path in folder.glob("*/*.png")], "no pictures"),
     ],
 )

@@ -164,7 +164,7 @@ def test_a_saved_run_is_opened_unchanged(tmp_path, quick):
     assert reopened.config == run.config
     assert_equal_states(reopened.state, run.state)
     assert reopened.dataset.test.names == dataset.test.names
-    with pytest.raises(UserError, match="already holds"):
+    with pytest.raises(UserError, match="exists already"):
         save_run(run, tmp_path / "run")
 
 

@@ -70,7 +70,7 @@ def test_a_folder_appears_whole_or_not_at_all(tmp_path):
 def test_a_new_folder_replaces_nothing(tmp_path):
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "mine").write_text("")
-    (tmp_path / "link").symlink_to(tmp_path / "elsewhere")
+    (tmp_path / "link").symlink_to(tmp_path / "full")
     (tmp_path / "file").write_text("")
     for name in ("full", "link", "file"):
         with (
@@ -78,6 +78,18 @@ def test_a_new_folder_replaces_nothing(tmp_path):
             new_folder(tmp_path / name),
         ):
             raise AssertionError("entered")
+
+
+@pytest.mark.parametrize("exists", [True, False])
+def test_a_new_folder_is_made_where_a_link_leads(tmp_path, exists):
+    place, link = tmp_path / "place", tmp_path / "link"
+    if exists:
+        place.mkdir()
+    link.symlink_to(place)
+    with new_folder(link) as temporary:
+        (temporary / "a.txt").write_text("a")
+    assert link.is_symlink()
+    assert (place / "a.txt").is_file()
 
 
 def test_a_line_that_cannot_be_added_is_reported_in_one_sentence(tmp_path):
