@@ -20,7 +20,7 @@ NOISE_WINDOW = 7  # side in pixels of the window that local noise is measured in
 SAMPLED_FRAMES = 12
 # The level is lowered until the brightened highlights, a high quantile of the pixels, do not exceed a value; but only
 # down to a part of itself, as a lamp in view must not leave all else in the dark.
-HIGHLIGHT_QUANTILE, MAX_HIGHLIGHTS, MIN_LEVEL_FACTOR = 0.98, 0.9, 0.5
+HIGHLIGHT_QUANTILE, MAX_HIGHLIGHTS, MIN_LEVEL_FACTOR = 0.95, 0.9, 0.5
 
 
 class Darkening(NamedTuple):

@@ -93,6 +93,6 @@ def _log_quantiles(frames: Float[Array, "V H W 3"], valid: Bool[Array, "V H W"] 
     counted = jnp.ones(grey.shape, bool) if valid is None else valid
     ordered = jnp.sort(jnp.where(counted, grey, jnp.inf).reshape(len(grey), -1))
     last = jnp.maximum(counted.sum((1, 2)) - 1, 0)[:, None]
-    places = jnp.round(last * jnp.asarray(KNOTS, grey.dtype)).astype(jnp.int32)
+    places = jnp.round(last.astype(grey.dtype) * jnp.asarray(KNOTS, grey.dtype)[None]).astype(last.dtype)
     places = jnp.minimum(places, last)  # above 2^24, a float32 may be larger
     return jnp.log(jnp.maximum(jnp.take_along_axis(ordered, places, axis=1), MIN_VALUE))

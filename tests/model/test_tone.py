@@ -125,7 +125,7 @@ def test_the_lit_level_is_lowered_for_highlights():
     level = lit(frames)
     assert 0.34 < level < 0.45
     undone = darkening(frames.mean(), level, of_light=True).undone(frames)
-    assert np.quantile(undone.max(-1), 0.98) == pytest.approx(0.9, abs=0.01)
+    assert np.quantile(undone.max(-1), 0.95) == pytest.approx(0.9, abs=0.01)
 
 
 @pytest.mark.parametrize("of_light", [True, False])
@@ -137,9 +137,9 @@ def test_frames_that_are_black_but_for_a_few_pixels_are_lit_to_mid_grey(of_light
 
 def test_the_lit_level_is_lowered_by_at_most_one_stop():
     frames = 0.1 * photographs(contrast=0.4)
-    frames[:, :24, :24] = 1.0
+    frames[:, :32, :32] = 1.0
     level = lit(frames)
     assert srgb_to_linear(np.array(level)) == pytest.approx(srgb_to_linear(np.array(0.46)) / 2, rel=1e-4)
     valid = np.ones(frames.shape[:3], bool)
-    valid[:, :24, :24] = False
+    valid[:, :32, :32] = False
     assert lit_level(frames, valid, frames[valid].mean(), of_light=True) > 0.44
