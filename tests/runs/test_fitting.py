@@ -1,6 +1,7 @@
 """`fit`: from a data set to a run, without files."""
 
 import dataclasses
+from unittest.mock import Mock
 
 import jax.numpy as jnp
 import numpy as np
@@ -12,7 +13,7 @@ from l2dgs_jax.cameras.flow import MIN_SIDES, brightened, optical_flow
 from l2dgs_jax.config import PRESETS, overrides
 from l2dgs_jax.data import load_dataset
 from l2dgs_jax.errors import UserError
-from l2dgs_jax.runs import Checkpoint, fit, open_run, save_run
+from l2dgs_jax.runs import Checkpoint, checkpoints, fit, open_run, save_run
 from l2dgs_jax.runtime import devices
 from l2dgs_jax.training import engine, initial_state, resolve
 from l2dgs_jax.training.state import StepReport
@@ -152,12 +153,16 @@ def test_a_run_renders_views_of_any_size(dataset, quick):
     assert run.renderer() is run.renderer(dataset.width, dataset.height)
 
 
-def test_a_saved_run_is_opened_unchanged(tmp_path, quick):
+def test_a_saved_run_is_opened_unchanged(tmp_path, quick, monkeypatch):
     scene = write_nerfies(tmp_path / "scene", 8, 24, 18, num_points=12)
     dataset = load_dataset(scene, downscale=2, held_out="3")
     config = tiny(coarse_steps=2, fine_steps=2, density=PRESETS["default"].density)
     run = fit(dataset, config)
     assert (run.config.downscale, run.config.held_out) == (2, "3")
+    with monkeypatch.context() as patch:
+        patch.setattr(checkpoints, "save", Mock(side_effect=OSError(28, "No space left on device")))
+        with pytest.raises(UserError, match="expected more room"):
+            save_run(run, tmp_path / "run")
     saved = save_run(run, tmp_path / "run")
     assert saved.folder == tmp_path / "run"
     reopened = open_run(tmp_path / "run")
