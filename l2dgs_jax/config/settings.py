@@ -4,7 +4,6 @@ import ast
 import dataclasses
 import json
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
@@ -325,9 +324,10 @@ class Config:
             UserError: a number is out of range.
         """
         model, window = self.model, self.loss.exposure_window
-        for name, number in _floats(dataclasses.asdict(self)):
-            if not math.isfinite(number):
-                raise UserError(f"--{name} {number}: expected a finite number")
+        parts = {"": self, "model.": model, "loss.": self.loss, "optim.": self.optim, "density.": self.density}
+        for name, value in ((f"{part}{name}", value) for part, of in parts.items() for name, value in vars(of).items()):
+            if isinstance(value, float) and not math.isfinite(value):
+                raise UserError(f"--{name.replace('_', '-')} {value}: expected a finite number")
         for name, count, least in (
             ("--batch-size", self.batch_size, 1),
             ("--checkpoint-every", self.checkpoint_every, 1),
@@ -369,16 +369,6 @@ class Config:
                 raise UserError(f"--model.initial-exponents {value}: expected exponents between 1 and 10")
         if self.steps < 1 or min(self.coarse_steps, self.fine_steps) < 0:
             raise UserError("--coarse-steps and --fine-steps: expected no negative number and at least one step in all")
-
-
-def _floats(settings: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, float]]:
-    """The floats among settings with the names of their options."""
-    for name, value in settings.items():
-        if isinstance(value, dict):
-            yield from _floats(value, f"{prefix}{name}.")
-        for number in value if isinstance(value, tuple) else (value,):
-            if isinstance(number, float):
-                yield f"{prefix}{name}".replace("_", "-"), number
 
 
 def _is_exponent(value: Any) -> bool:
