@@ -107,9 +107,9 @@ def by_name(folder: Path, suffixes: Sequence[str] = SUFFIXES) -> dict[str, list[
 def _visible(folder: Path) -> Iterator[Path]:
     """The files in a folder but hidden ones, such as macOS writes beside files; follows links that do not lead back."""
     for top, folders, files in os.walk(folder, followlinks=True):
-        place = Path(top)
+        place, resolved = Path(top), Path(top).resolve()
         visible = [name for name in folders if not name.startswith(".")]
-        folders[:] = [name for name in visible if not place.resolve().is_relative_to((place / name).resolve())]
+        folders[:] = [name for name in visible if not resolved.is_relative_to((place / name).resolve())]
         yield from (place / name for name in files if not name.startswith("."))
 
 
