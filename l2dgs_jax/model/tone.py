@@ -60,8 +60,9 @@ def darkening(
         dark, lit = srgb_to_linear(np.array([dark_level, lit_level]))
         well = np.linspace(0.1, 0.9, 81)
         low = linear_to_srgb(min(dark / lit, 1.0) * srgb_to_linear(well))
-        exponent = np.clip(np.polyfit(np.log(well), np.log(low), 1)[0], MIN_EXPONENT, MAX_EXPONENT)
-        return Darkening(float(exponent), float(np.exp(np.mean(np.log(low) - exponent * np.log(well)))))
+        slope = np.polyfit(np.log(well), np.log(low), 1)[0]
+        exponent = round(float(np.clip(slope, MIN_EXPONENT, MAX_EXPONENT)), 3)
+        return Darkening(exponent, float(np.exp(np.mean(np.log(low) - exponent * np.log(well)))))
     exponent = MIN_EXPONENT if tone == "gain" else float(tone)
     return Darkening(exponent, min(dark_level / lit_level**exponent, 1.0))
 

@@ -88,11 +88,11 @@ def resolve(config: Config, dataset: Dataset) -> Config:
     if model.decomposition != "retinex":
         model = dataclasses.replace(model, initial_exponents=None)  # there are no B1 and B2
     if model.initial_exponents and model.initial_exponents[0] == "auto":
-        model = dataclasses.replace(model, initial_exponents=(round(exponent, 3), model.initial_exponents[1]))
+        model = dataclasses.replace(model, initial_exponents=(exponent, model.initial_exponents[1]))
     if model.initial_illumination == "auto":
         b2 = model.initial_exponents[1] if model.initial_exponents else networks.EXPONENT_CENTRE
         b2 = 1.0 if model.unit_exponent == "b2" else b2
-        model = dataclasses.replace(model, initial_illumination=round(gain ** (1 / b2), 3))
+        model = dataclasses.replace(model, initial_illumination=float(f"{gain ** (1 / b2):.3g}"))
     return dataclasses.replace(config, model=model)
 
 

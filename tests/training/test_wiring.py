@@ -342,3 +342,11 @@ def test_the_initial_illumination_darkens_as_much_as_the_frames(dataset, unit_ex
     resolved = resolve(config, dataset)
     gain = split_darkening(dataset.train, resolved).gain
     assert resolved.model.initial_illumination**b2 == pytest.approx(gain, rel=0.02)
+
+
+@pytest.mark.parametrize("tone", [1.0004, 9.9997])
+def test_a_given_tone_is_the_exponent_that_training_starts_at(dataset, tone):
+    config = config_of(**{"model.domain": "values", "model.tone": tone, "model.initial_exponents": ("auto", 9.0)})
+    resolved = resolve(config, dataset)
+    assert resolved.model.initial_exponents == (tone, 9.0)
+    initial_state(dataset, resolved)
