@@ -17,6 +17,7 @@ from jaxtyping import UInt8
 
 from experiments.members import Member, labels
 from experiments.web_page import write_page
+from l2dgs_jax.cameras import median_depth
 from l2dgs_jax.data.images import encode_jpeg, to_bytes
 from l2dgs_jax.data.parsing import read_json, value
 from l2dgs_jax.data.stacks import evenly_spread
@@ -98,7 +99,10 @@ def _scene(study: Path, name: str, members: dict[str, Member], count: int) -> di
             raise UserError(
                 f"{study / member['name']}: has other held-out views than members before it; expected the same"
             )
-        outputs = [*views(run, Camera(*(x[chosen] for x in own.cameras)))]
+        # depth in a unit of the scene itself, because the scale of the world differs (data.normalise)
+        unit = median_depth(run.dataset.train.cameras, run.dataset.points)
+        rendered = views(run, Camera(*(x[chosen] for x in own.cameras)))
+        outputs = [output._replace(depth=output.depth / unit) for output in rendered]
         ranges = ranges or display.ranges(outputs)
         for kind, shown in (("welllit", pictures), ("depth", depths)):
             shown[label] = [_url(display.shown(output, kind, ranges)) for output in outputs]

@@ -2,7 +2,7 @@
 
 Scores compare the estimates of held-out low-light views with these views, by scene and variant; means over the scenes
 stand beside the paper's. A variant that learns from brightened frames makes no such estimate. OUT/lowlight.md has the
-table, OUT/lowlight.json the same numbers.
+table, OUT/lowlight.json the scores of each scene and seed.
 """
 
 import sys

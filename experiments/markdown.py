@@ -11,8 +11,8 @@ def table_rows(lines: Sequence[Sequence[str]]) -> str:
 
 
 def mean_and_spread(scores: float | Sequence[float], digits: int) -> str:
-    """The mean and, of several scores, half of their range."""
-    spread = f" ± {np.ptp(scores) / 2:.{digits}f}" if np.size(scores) > 1 else ""
+    """The mean and, of several finite scores, half of their range."""
+    spread = f" ± {np.ptp(scores) / 2:.{digits}f}" if np.size(scores) > 1 and np.isfinite(scores).all() else ""
     return f"{np.mean(scores):.{digits}f}{spread}"
 
 

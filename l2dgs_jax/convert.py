@@ -37,7 +37,8 @@ class Convert:
 def main(arguments: Sequence[str]) -> None:
     """Convert as the command line says."""
     options = command_line.parse(Convert, arguments, "convert")
-    dataset = load_dataset(options.scene, options.downscale, options.format, options.held_out)
+    # the world as it is stored, because some presets train in it
+    dataset = load_dataset(options.scene, options.downscale, options.format, options.held_out, normalise=False)
     for note in dataset.notes:
         print(f"note: {note}")
     LAYOUTS[options.to].write(dataset, options.output)

@@ -48,7 +48,8 @@ def main(arguments: Sequence[str]) -> None:
     options = command_line.parse(Simulate, arguments, "simulate")
     options.darkening.check()
     with new_folder(options.output) as folder:
-        dataset = load_dataset(options.scene, options.downscale, options.format, options.held_out)
+        # the world as it is stored, because some presets train in it
+        dataset = load_dataset(options.scene, options.downscale, options.format, options.held_out, normalise=False)
         for note in dataset.notes:
             print(f"note: {note}")
         dataset, frames = darken(dataset, options.darkening)

@@ -210,7 +210,7 @@ def test_the_command_converts_and_reports(tmp_path, capsys):
     assert "wrote 8 frames of 16x12 and 60 points" in capsys.readouterr().out
     dataset = data.load_dataset(tmp_path / "out")
     assert dataset.test.names == ("000000", "000004")
-    assert_same(dataset, data.load_dataset(scene, 2, held_out="4"))
+    assert_same(dataset, data.load_dataset(scene, 2, held_out="4", normalise=False))
     assert json.loads((tmp_path / "out" / "dataset.json").read_text())["val_ids"] == ["000000", "000004"]
 
 

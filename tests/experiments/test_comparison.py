@@ -45,7 +45,7 @@ def test_every_member_of_the_first_seed_has_its_own_pictures(study, monkeypatch)
         return SimpleNamespace(names=names.get(focal, "abc"), cameras=cameras, images=flat(0.1), welllit=flat(0.9))
 
     def views(run, cameras):
-        """As bright as the run, and as deep as the focal length of its own cameras."""
+        """As bright as the run, and as far away as the points of its own world."""
         assert (run.number == cameras.K).all()
         for picture in flat(0.2 + 0.1 * run.number)[: len(cameras.time)]:
             ones, none = np.ones((6, 8), np.float32), np.zeros(0)
@@ -55,7 +55,9 @@ def test_every_member_of_the_first_seed_has_its_own_pictures(study, monkeypatch)
 
     def opened(path):
         number = int(path.name)
-        return SimpleNamespace(number=number, dataset=SimpleNamespace(test=split(number)))
+        train = SimpleNamespace(cameras=Camera(np.eye(4)[None], np.eye(3)[None], np.zeros(1)))
+        points = np.array([[0.0, 0.0, 0.2 + 0.1 * number]])
+        return SimpleNamespace(number=number, dataset=SimpleNamespace(train=train, test=split(number), points=points))
 
     names = {}
     monkeypatch.setattr(comparison, "views", views)
@@ -79,6 +81,7 @@ def test_every_member_of_the_first_seed_has_its_own_pictures(study, monkeypatch)
     assert len({tuple(pictures) for pictures in scene["pictures"].values()}) == len(scene["pictures"])
     assert (scene["times"], scene["size"]) == ([0.0, 1.0], [8, 6])
     assert list(scene["depths"]) == ours
+    assert len({tuple(pictures) for pictures in scene["depths"].values()}) == 1
     assert scene["curves"]["b"] == [[1.0, 20.0], [2.0, 30.0]]
     assert scene["curves"][ours[0]] == []
     names[2] = "abd"

@@ -128,6 +128,7 @@ def test_a_single_combination_has_a_row_for_each_scene():
 def test_the_documentation_shows_what_was_measured(path):
     pages = [page.read_text() for page in (ROOT / "README.md", *(ROOT / "docs").glob("*.md"))]
     found = table.collect([path])
+    assert all(scores for scenes in found.values() for scores in scenes.values())
     assert any(shown in page for page in pages for shown in (table.markdown(found), table.brief(found)))
 
 
