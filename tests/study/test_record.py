@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from experiments import table1, table3
+from experiments import lowlight, table1, table3
 from experiments.markdown import percentages
 from experiments.published import TABLE3
 from experiments.quality import compare_poses, table
@@ -149,6 +149,11 @@ def test_the_documentation_shows_table_3_as_measured():
 def test_the_documentation_shows_table_1_as_measured():
     scenes = json.loads((ROOT / "experiments/studies/results/table1.json").read_text())["scenes"]
     assert table1.markdown(scenes) in (ROOT / "docs" / "comparison.md").read_text()
+
+
+def test_the_documentation_shows_the_scores_of_the_dark_input_as_measured():
+    scenes = json.loads((ROOT / "experiments/studies/results/lowlight.json").read_text())["scenes"]
+    assert lowlight.markdown(scenes) in (ROOT / "docs" / "comparison.md").read_text()
     for scene, methods in scenes.items():
         for region in methods["L2DGS"]:
             for measure in ("ssim", "psnr_gain"):
