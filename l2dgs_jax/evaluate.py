@@ -48,7 +48,7 @@ class Evaluate:
 def main(arguments: Sequence[str]) -> None:
     """Evaluate as the command line says."""
     options = command_line.parse(Evaluate, arguments, "evaluate")
-    if options.json and (options.json.is_dir() or not options.json.parent.is_dir()):
+    if options.json and (not options.json.parent.is_dir() or (options.json.exists() and not options.json.is_file())):
         raise UserError(f"--json {options.json}: cannot be written; expected a file in an existing folder")
     lpips = find_lpips({"alex": options.lpips_alex, "vgg": options.lpips_vgg})
     run = open_run(options.run, options.stage)

@@ -1,6 +1,7 @@
 """`python -m l2dgs_jax.prepare VIDEO_OR_FOLDER OUT`: find camera poses and points for a video, even a dark one."""
 
 import dataclasses
+import shlex
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -42,7 +43,8 @@ def main(arguments: Sequence[str]) -> None:
         print("\ninterrupted; the same command goes on from here", file=sys.stderr)
         sys.exit(130)
     print(report.summary(found))
-    print(f"next: look at {options.output / 'contact_sheet.png'}, then python -m l2dgs_jax.train {options.output}")
+    scene = shlex.quote(str(options.output))
+    print(f"next: look at {options.output / 'contact_sheet.png'}, then python -m l2dgs_jax.train {scene}")
 
 
 if __name__ == "__main__":

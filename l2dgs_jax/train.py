@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import functools
 import shlex
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,7 +28,7 @@ from l2dgs_jax.runs.report import REPORT, Report
 from l2dgs_jax.runs.tensorboard import TensorBoard, tensorboardx
 from l2dgs_jax.runtime import command_line, devices, distributed
 from l2dgs_jax.runtime.distributed import Hosts
-from l2dgs_jax.runtime.files import is_taken, new_folder
+from l2dgs_jax.runtime.files import is_taken, is_writable, new_folder
 from l2dgs_jax.runtime.locks import locked
 from l2dgs_jax.runtime.memory import memory_errors
 from l2dgs_jax.runtime.signals import stop_requests
@@ -92,6 +93,8 @@ def _train(options: Train) -> None:
     folder, config, first = options.output, options.config, jax.process_index() == 0
     assert folder is not None
     _check_devices(options)
+    if first and not is_writable(folder.parent):
+        raise UserError(f"{folder}: cannot be created; expected an --output in a writable folder")
     if options.tensorboard and first:
         tensorboardx()
     if options.view and first:
@@ -143,7 +146,7 @@ def _record(dataset: Dataset, options: Train, config: Config, start: Checkpoint,
         print(f"note: {note}")
     warning = misfit(dataset, config)
     if warning:
-        print(f"warning: {warning}")
+        print(f"warning: {warning}", file=sys.stderr)
     print(f"{dataset.name}: {len(dataset.train.names)} frames of {dataset.width}x{dataset.height}; run folder {folder}")
     if options.report:
         print(f"watch it in a browser: {(folder / REPORT).absolute().as_uri()}")
@@ -151,7 +154,8 @@ def _record(dataset: Dataset, options: Train, config: Config, start: Checkpoint,
     write_image(folder / runs.CONTACT_SHEET, contact_sheet(run))
     video = write_run_video(run, folder / runs.VIDEO, quiet=options.quiet)
     print(f"wrote {folder / runs.CONTACT_SHEET} and {video}")
-    print(f"next: python -m l2dgs_jax.evaluate {folder}   or   python -m l2dgs_jax.render {folder}")
+    quoted = shlex.quote(str(folder))
+    print(f"next: python -m l2dgs_jax.evaluate {quoted}   or   python -m l2dgs_jax.render {quoted}")
 
 
 def _fit(dataset: Dataset, options: Train, config: Config, start: Checkpoint, display: Display) -> Run:

@@ -1,5 +1,6 @@
 """All settings, the named presets, and access to settings by their dotted names."""
 
+from l2dgs_jax.config.overrides import from_dict
 from l2dgs_jax.config.presets import PRESETS
 from l2dgs_jax.config.settings import (
     EXECUTION,
@@ -11,7 +12,6 @@ from l2dgs_jax.config.settings import (
     LossConfig,
     ModelConfig,
     OptimConfig,
-    from_dict,
     to_dict,
 )
 

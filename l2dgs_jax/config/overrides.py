@@ -92,6 +92,18 @@ def checked(name: str, value: Any) -> Any:
     raise ValueError(f"{name} is {value!r}; expected {kind.__name__ if isinstance(kind, type) else kind}")
 
 
+def from_dict(values: dict[str, Any]) -> Config:
+    """The inverse of `settings.to_dict`; settings that are missing have their defaults.
+
+    Raises:
+        ValueError: a setting is unknown, or takes no such value.
+    """
+    named: dict[str, Any] = {}
+    for name, value in values.items():
+        named |= {f"{name}.{field}": v for field, v in value.items()} if isinstance(value, dict) else {name: value}
+    return replace(Config(), {name: checked(name, value) for name, value in named.items()})
+
+
 def outline(config: Config) -> Config:
     """The settings with those of `TRACED` set to 0: equal for scenes that can share a compiled program."""
     return replace(config, {name: _blank(read(config, name)) for name in TRACED})

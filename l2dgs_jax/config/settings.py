@@ -383,18 +383,3 @@ EXECUTION = frozenset({"checkpoint_every", "frame_memory", "keep_checkpoints"})
 def to_dict(config: Config) -> dict:
     """The settings as nested dictionaries of JSON values."""
     return json.loads(json.dumps(dataclasses.asdict(config)))
-
-
-def from_dict(values: dict) -> Config:
-    """The inverse of `to_dict`.
-
-    Raises:
-        TypeError: a setting is unknown.
-    """
-    parts = {"model": ModelConfig, "loss": LossConfig, "optim": OptimConfig, "density": DensityConfig}
-    return Config(**{key: parts[key](**_with_tuples(v)) if key in parts else v for key, v in values.items()})
-
-
-def _with_tuples(values: dict[str, Any]) -> dict[str, Any]:
-    """Turn lists back into the tuples that JSON made them of."""
-    return {key: tuple(v) if isinstance(v, list) else v for key, v in values.items()}

@@ -5,6 +5,7 @@ import signal
 import sys
 import warnings
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any, TypeVar
 
 import jax
@@ -12,6 +13,8 @@ import tyro
 
 from l2dgs_jax.errors import Interrupted, UserError
 from l2dgs_jax.runtime import devices
+from l2dgs_jax.runtime.files import is_writable
+from l2dgs_jax.runtime.memory import memory_errors
 
 T = TypeVar("T")
 
@@ -39,7 +42,8 @@ def run(
         with warnings.catch_warnings():
             warnings.showwarning = _show_warning  # type: ignore[assignment]
             try:
-                command(sys.argv[1:] if arguments is None else arguments)
+                with memory_errors(lambda: "at this size", "smaller or fewer images, or more memory"):
+                    command(sys.argv[1:] if arguments is None else arguments)
             except SystemExit:  # after --help
                 sys.stdout.flush()
                 raise
@@ -90,9 +94,15 @@ def use_compilation_cache() -> None:
     base = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
     without_home = base.startswith("~")  # as in containers whose user has none
     folder = os.environ.get("L2DGS_JAX_CACHE", "off" if without_home else os.path.join(base, "l2dgs_jax"))
-    if folder != "off":
+    if folder == "off":
+        return
+    if is_writable(Path(folder)):
         jax.config.update("jax_compilation_cache_dir", folder)
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+    else:
+        _show_warning(
+            f"{folder}: not writable, so compiled programs are not kept; L2DGS_JAX_CACHE names another folder"
+        )
 
 
 def use_huge_pages() -> None:

@@ -19,17 +19,23 @@ NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # the disk or the user's qu
 def replacing(path: Path) -> Iterator[Path]:
     """A temporary file beside `path` to write to; it replaces `path` if the block ends without an error.
 
+    If `path` is a symbolic link, it stays one, and the file that it leads to is replaced.
+
     Raises:
-        UserError: the folder is missing or not writable, or `path` is a folder.
+        UserError: the folder is missing or not writable, or `path` is a folder or a device.
     """
-    temporary = path.with_name(f"{path.stem}.tmp{path.suffix}")
+    target = Path(os.path.realpath(path))
+    temporary = target.with_name(f"{target.stem}.tmp{path.suffix}")
     try:
-        if not path.parent.is_dir():
+        if not target.parent.is_dir():
             raise UserError(f"{path}: cannot be written; expected an existing folder {path.parent}")
-        if path.is_dir():
+        if target.is_dir():
             raise UserError(f"{path}: is a folder; expected a file to write")
+        if target.exists() and not target.is_file():
+            raise UserError(f"{path}: is a device; expected a file to write")
+        temporary.touch()  # a folder that is not writable is noticed before the work
         yield temporary
-        os.replace(temporary, path)
+        os.replace(temporary, target)
     except OSError as error:
         raise unwritable(path, error) from None
     finally:
@@ -141,6 +147,13 @@ def _spelled_out(content: Any) -> Any:
     if isinstance(content, float) and not math.isfinite(content):
         return json.dumps(content)  # writes these names, which are JavaScript's
     return content
+
+
+def is_writable(folder: Path) -> bool:
+    """Whether files can be created in a folder, which is created itself, with its parents, if it is missing."""
+    place = folder.absolute()
+    nearest = next(parent for parent in (place, *place.parents) if parent.exists())
+    return nearest.is_dir() and os.access(nearest, os.W_OK | os.X_OK)
 
 
 def is_taken(path: Path) -> bool:

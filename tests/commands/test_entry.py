@@ -7,9 +7,11 @@ import subprocess
 import sys
 import warnings
 
+import jax
 import pytest
 
 from l2dgs_jax.__main__ import COMMANDS
+from l2dgs_jax.errors import OUT_OF_MEMORY
 from l2dgs_jax.runtime import command_line
 from l2dgs_jax.runtime.files import replacing
 
@@ -61,6 +63,26 @@ def test_a_warning_is_printed_as_one_sentence(capsys):
 
     command_line.run(command, [])
     assert capsys.readouterr().err == "warning: it is slow\n"
+
+
+def test_running_out_of_memory_is_reported_in_one_sentence(capsys):
+    def command(arguments):
+        raise MemoryError
+
+    with pytest.raises(SystemExit) as stop:
+        command_line.run(command, [])
+    assert stop.value.code == OUT_OF_MEMORY
+    assert capsys.readouterr().err.startswith("error: out of memory")
+
+
+def test_a_cache_that_cannot_be_written_is_reported_once_and_not_used(tmp_path, monkeypatch, capsys):
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("L2DGS_JAX_CACHE", str(tmp_path / "file" / "cache"))
+    before = jax.config.jax_compilation_cache_dir
+    command_line.run(lambda _: None, [])
+    assert jax.config.jax_compilation_cache_dir == before
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"warning: {tmp_path / 'file' / 'cache'}: not writable")
 
 
 @pytest.mark.parametrize(("handler", "ends"), [(signal.SIG_DFL, True), (signal.SIG_IGN, False)])

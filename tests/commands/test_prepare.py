@@ -181,6 +181,9 @@ FAULTS = {
 }
 
 
+WITH_WORK = ("tripod", "turning on the spot", "work of others")  # with work to go on from, or not prepare's
+
+
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_fault_is_named_in_one_sentence_and_nothing_is_written(tmp_path, fault):
     message, make = FAULTS[fault]
@@ -194,6 +197,7 @@ def test_a_fault_is_named_in_one_sentence_and_nothing_is_written(tmp_path, fault
     assert "\n" not in text
     assert all(path.exists() for path in before)
     assert (tmp_path / "out").exists() == (fault == "output exists")
+    assert (tmp_path / "out.partial").exists() == (fault in WITH_WORK)
 
 
 def test_an_output_that_cannot_be_written_is_named(tmp_path):
@@ -226,6 +230,13 @@ def test_changed_settings_or_pictures_start_over(tmp_path):
     (work / "candidates.json").write_text("[]")
     os.utime(source / "a 3.png", (2e9, 2e9))  # repaired in place
     assert not (open_work(frames=7) / "candidates.json").exists()
+
+
+def test_an_output_among_the_pictures_starts_nothing_over(tmp_path, capsys):
+    source = pictures(tmp_path)
+    for _ in range(3):
+        pipeline._open_work(source, source / "out", CaptureConfig())
+    assert capsys.readouterr().out.count("going on in") == 2
 
 
 @pytest.mark.slow

@@ -330,6 +330,19 @@ def test_what_cannot_start_leaves_no_folder(refuses, scene, tmp_path, monkeypatc
     refuses(scene, unlit, "None", "--output", tmp_path / "run", naming=[f"{unlit} None", "--model.relative-light"])
     refuses(scene, "--model.plane-size=1", "--output", tmp_path / "run", naming=["--model.plane-size 1", "at least 2"])
     assert not (tmp_path / "run").exists()
+    (tmp_path / "file").write_text("")
+    refuses(scene, "--output", tmp_path / "file" / "run", naming=["--output", str(tmp_path / "file" / "run")])
+
+
+def test_a_warning_is_shown_without_progress_too(scene, tmp_path, monkeypatch, capsys):
+    def stop(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(train, "misfit", lambda *_: "22 frames are few")
+    monkeypatch.setattr(train, "_fit", stop)
+    with pytest.raises(KeyboardInterrupt):
+        train.main([str(scene), "--output", str(tmp_path / "run"), "--quiet", *TINY])
+    assert capsys.readouterr() == ("", "warning: 22 frames are few\n")
 
 
 def test_options_of_the_run_are_read_together_with_a_preset(scene, tmp_path):

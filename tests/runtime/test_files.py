@@ -1,11 +1,14 @@
 """Files and folders that are written whole or not at all."""
 
+import errno
 import json
+import os
+from pathlib import Path
 
 import pytest
 
 from l2dgs_jax.errors import DISK_FULL, UserError
-from l2dgs_jax.runtime.files import append_line, new_folder, replacing, write_json
+from l2dgs_jax.runtime.files import append_line, is_writable, new_folder, replacing, write_json
 
 
 def test_a_file_is_replaced_whole_or_not_at_all(tmp_path):
@@ -40,6 +43,40 @@ def test_a_file_that_cannot_be_written_is_reported_and_leaves_nothing_behind(tmp
     with pytest.raises(UserError, match=r"file\.txt: cannot be written \(No space left on device\); .* room"):
         fill_the_disk()
     assert not list(tmp_path.iterdir())
+
+
+def test_a_link_stays_one_and_what_is_no_file_stays_what_it_is(tmp_path):
+    (tmp_path / "target").write_text("old")
+    (tmp_path / "link.txt").symlink_to("target")
+    with replacing(tmp_path / "link.txt") as temporary:
+        assert temporary.suffix == ".txt"
+        temporary.write_text("new")
+    assert (tmp_path / "link.txt").is_symlink()
+    assert (tmp_path / "target").read_text() == "new"
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(UserError, match="pipe: is a device; expected a file"), replacing(tmp_path / "pipe"):
+        pass
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["link.txt", "pipe", "target"]
+    assert (tmp_path / "pipe").is_fifo()
+
+
+def test_a_folder_that_takes_no_files_is_noticed_before_the_work(monkeypatch, tmp_path):
+    def refuse(*_, **__):
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    monkeypatch.setattr(Path, "touch", refuse)
+    begun = False
+    with pytest.raises(UserError, match=r"a\.txt: cannot be written"), replacing(tmp_path / "a.txt"):
+        begun = True
+    assert not begun
+
+
+def test_files_can_be_created_in_folders_that_are_missing_but_not_below_files(tmp_path):
+    (tmp_path / "file").write_text("")
+    assert is_writable(tmp_path)
+    assert is_writable(tmp_path / "new" / "newer")
+    assert not is_writable(tmp_path / "file")
+    assert not is_writable(tmp_path / "file" / "new")
 
 
 def test_a_name_that_is_too_long_is_reported_in_one_sentence(tmp_path):

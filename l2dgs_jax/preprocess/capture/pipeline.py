@@ -80,12 +80,11 @@ def prepare(source: Path, output: Path, cfg: CaptureConfig, curve: Curve = brigh
     )
     for made in (workplace.frames, workplace.copies, workplace.masks):
         made.mkdir(exist_ok=True)
-    candidates = _scan(source, work)
-    if len(candidates) < FEWEST_FRAMES:
-        raise UserError(
-            f"{source}: holds {len(candidates)} frame(s); "
-            f"expected a video or a folder of at least {FEWEST_FRAMES} frames of a moving camera"
-        )
+    try:
+        candidates = _scan(source, work)
+    except UserError:
+        shutil.rmtree(work)  # there is nothing to go on with
+        raise
     chosen = frames.sample([candidate.sharpness for candidate in candidates], cfg.frames)
     frames.extract(source, candidates, chosen, workplace.frames)
     names = [candidates[i].name for i in chosen]
@@ -139,11 +138,12 @@ def prepare(source: Path, output: Path, cfg: CaptureConfig, curve: Curve = brigh
 def _open_work(source: Path, output: Path, cfg: CaptureConfig) -> Path:
     """The folder of intermediate results; results of other settings or another source are deleted."""
     work = output.absolute().with_name(f"{output.absolute().name}.partial")
-    inside = filter(Path.is_file, source.iterdir()) if source.is_dir() else ()
+    # not the folder itself, which changes if `output` is inside
+    files = sorted(filter(Path.is_file, source.iterdir())) if source.is_dir() else [source]
     settings = json.dumps(
         {
             "source": str(source.absolute()),
-            "changed": max(path.stat().st_mtime_ns for path in (source, *inside)),
+            "changed": {path.name: path.stat().st_mtime_ns for path in files},
             "frames": cfg.frames,
             "camera_model": cfg.camera_model,
         },
@@ -167,6 +167,11 @@ def _scan(source: Path, work: Path) -> list[Candidate]:
     if record.exists():
         return [Candidate(*fields) for fields in json.loads(record.read_text())]
     candidates = frames.scan(source)
+    if len(candidates) < FEWEST_FRAMES:
+        raise UserError(
+            f"{source}: holds {len(candidates)} frame(s); "
+            f"expected a video or a folder of at least {FEWEST_FRAMES} frames of a moving camera"
+        )
     with replacing(record) as temporary:
         temporary.write_text(json.dumps(candidates))
     return candidates
