@@ -25,6 +25,7 @@ from l2dgs_jax.errors import UserError
 from l2dgs_jax.runs import open_run, read_metrics
 from l2dgs_jax.runs.views import views
 from l2dgs_jax.runtime import command_line
+from l2dgs_jax.runtime.files import takes_file
 from l2dgs_jax.runtime.pages import data_url
 from l2dgs_jax.study import report
 from l2dgs_jax.types import Camera
@@ -54,7 +55,7 @@ def main(arguments: Sequence[str]) -> None:
     options = tyro.cli(Options, args=arguments)
     if options.views < 1:
         raise UserError(f"--views {options.views}: expected at least 1")
-    if options.output.is_dir() or not options.output.parent.is_dir():
+    if not takes_file(options.output):
         raise UserError(f"{options.output}: cannot be written; expected a file in an existing folder")
     scenes = _members(options.study)
     names = report.scene_names(scenes)

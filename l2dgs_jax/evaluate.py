@@ -14,7 +14,7 @@ from l2dgs_jax.runs.lpips_weights import find_lpips
 from l2dgs_jax.runs.score_table import table
 from l2dgs_jax.runs.scores import evaluate
 from l2dgs_jax.runtime import command_line
-from l2dgs_jax.runtime.files import write_json
+from l2dgs_jax.runtime.files import takes_file, write_json
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Evaluate:
 def main(arguments: Sequence[str]) -> None:
     """Evaluate as the command line says."""
     options = command_line.parse(Evaluate, arguments, "evaluate")
-    if options.json and (not options.json.parent.is_dir() or (options.json.exists() and not options.json.is_file())):
+    if options.json and not takes_file(options.json):
         raise UserError(f"--json {options.json}: cannot be written; expected a file in an existing folder")
     lpips = find_lpips({"alex": options.lpips_alex, "vgg": options.lpips_vgg})
     run = open_run(options.run, options.stage)

@@ -14,6 +14,7 @@ from l2dgs_jax.data.images import SUFFIXES, write_image
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.preprocess.motion_masks import as_taken, compute_masks, preview, write_masks
 from l2dgs_jax.runtime import command_line
+from l2dgs_jax.runtime.files import takes_file
 
 
 @dataclass(frozen=True)
@@ -52,7 +53,7 @@ def main(arguments: Sequence[str]) -> None:
     dataset = load_dataset(options.scene, options.downscale, options.format, options.held_out)
     if not os.access(options.scene, os.W_OK):
         raise UserError(f"{options.scene}: cannot be written; expected a writable folder to put masks in")
-    if options.preview and not options.preview.parent.is_dir():
+    if options.preview and not takes_file(options.preview):
         raise UserError(f"--preview {options.preview}: cannot be written; expected a file in an existing folder")
     if options.preview and options.preview.suffix.lower() not in SUFFIXES:
         raise UserError(f"--preview {options.preview}: not a picture's suffix; expected one of {', '.join(SUFFIXES)}")

@@ -156,6 +156,11 @@ def is_writable(folder: Path) -> bool:
     return nearest.is_dir() and os.access(nearest, os.W_OK | os.X_OK)
 
 
+def takes_file(path: Path) -> bool:
+    """Whether `replacing` can write to `path`: no folder or device is there, and the folder around it exists."""
+    return path.parent.is_dir() and (path.is_file() or not path.exists())
+
+
 def is_taken(path: Path) -> bool:
     """Whether `path` exists and is not an empty folder."""
     return path.exists() and (not path.is_dir() or any(path.iterdir()))
