@@ -53,9 +53,9 @@ def main(arguments: Sequence[str]) -> None:
     lpips = find_lpips({"alex": options.lpips_alex, "vgg": options.lpips_vgg})
     run = open_run(options.run, options.stage)
     result = evaluate(run, options.split, lpips=lpips, convention=options.region_convention)
-    print(table(result))
     if options.json:
         write_json(options.json, result)
+    print(table(result))
 
 
 if __name__ == "__main__":

@@ -150,7 +150,8 @@ def _presets() -> dict[str, Config]:
     curve = dataclasses.replace(
         four_d,
         model=dataclasses.replace(four_d.model, decomposition="curve", background=0.0),
-        # ssim 0.25, with eta 1, is its 0.2 of SSIM to 0.8 of L1; its later priors are weighted 1 to 5 as here.
+        # ssim 0.25, with eta 1, is its 0.2 of SSIM to 0.8 of L1 but for eps; the priors have the ratio that they had in
+        # its code until July 2025.
         loss=dataclasses.replace(four_d.loss, ssim=0.25, eta_start=1.0, eta_end=1.0, equalisation=0.01, bend=0.05),
     )
     # Only the coarse stage, in which the motion field does not act; without tracks, because their paths would move.

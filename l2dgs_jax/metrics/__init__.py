@@ -4,7 +4,7 @@ from l2dgs_jax.metrics.gain import best_gain
 from l2dgs_jax.metrics.images import partial_ssim, psnr, ssim, ssim_map
 from l2dgs_jax.metrics.lpips import NETWORKS, Lpips, Network
 from l2dgs_jax.metrics.measures import FLIP, MS_SSIM, PSNR, SSIM, SSIM_3DGS, Measure, lpips_measure
-from l2dgs_jax.metrics.regions import BASIC, Convention, Score, compare, known, region_masks, summarise
+from l2dgs_jax.metrics.regions import BASIC, Convention, Score, clipped, compare, known, region_masks, summarise
 from l2dgs_jax.metrics.warping import warping_error_map
 
 __all__ = [
@@ -21,6 +21,7 @@ __all__ = [
     "Network",
     "Score",
     "best_gain",
+    "clipped",
     "compare",
     "known",
     "lpips_measure",

@@ -46,10 +46,21 @@ def compare(
         always by the convention "masked". Regions without pixels are left out; by the convention "paper", "dynamic" and
         "static" stay, because there LPIPS of no area is 0. A score is None if the region has too few pixels for it, and
         NaN if values are not finite. "area" is the region's share of the frame.
+
+    Raises:
+        ValueError: an image has integers, or a mask has other values than booleans.
     """
-    prediction, truth = np.asarray(prediction), np.asarray(truth, prediction.dtype)
+    prediction, truth = np.asarray(prediction), np.asarray(truth)
+    for name, image in (("prediction", prediction), ("truth", truth)):
+        if not np.issubdtype(image.dtype, np.floating):
+            raise ValueError(f"{name}: an image of {image.dtype}; expected floating-point values in [0, 1]")
+    for name, mask in (("dynamic", dynamic), ("valid", valid), ("covisible", covisible)):
+        if mask is not None and mask.dtype != bool:
+            raise ValueError(f"{name}: a mask of {mask.dtype}; expected booleans")
     masks = region_masks(prediction.shape[:2], dynamic, valid, covisible)
-    truth = np.where(masks["overall"][..., None], truth, prediction)
+    counted = masks["overall"][..., None]
+    prediction = np.where(np.isfinite(prediction), prediction, np.where(counted, prediction.dtype.type(np.nan), 0))
+    truth = np.where(counted, truth.astype(prediction.dtype), prediction)
     finite = np.isfinite((prediction - truth)[masks["overall"]]).all()
     whole = {name: _maps(measure, prediction, truth, masks["overall"]) for name, measure in measures.items()}
 
@@ -86,6 +97,11 @@ def region_masks(
     if covisible is not None:
         masks["covisible"] = counted & np.asarray(covisible)
     return masks
+
+
+def clipped(image: Float[np.ndarray, "*S"]) -> Float[np.ndarray, "*S"]:
+    """Values clipped to [0, 1]; infinite ones become NaN, so that they are not taken for white or black."""
+    return np.clip(np.where(np.isfinite(image), image, np.nan), 0, 1)
 
 
 def summarise(frames: Sequence[Mapping[str, Score]]) -> dict[str, Score]:

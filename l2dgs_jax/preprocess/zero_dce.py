@@ -51,7 +51,10 @@ def _bend(images: Float[Array, "B H W 3"], curves: Float[Array, "B H W 24"]) -> 
 
 
 def loss(net: Net, images: Float[Array, "B H W 3"]) -> Scalar:
-    """Zero-DCE's objective: keep differences between blocks, expose blocks well, grey mean, smooth curves."""
+    """Zero-DCE's objective: keep differences between blocks, expose blocks well, grey mean, smooth curves.
+
+    The terms are those of the paper, the weights those of its authors' code.
+    """
     parameters = curves(net, images)
     bright = _bend(images, parameters)
     means = bright.mean((1, 2))

@@ -61,9 +61,7 @@ def _after_gain(scores: dict) -> list[str]:
 
 
 def _warping(scores: dict) -> list[str]:
-    if scores.get("warping_error") is None:
-        return []
-    if "warping_error_gain" not in scores:
-        return [f"warping error {scores['warping_error']:.5f}"]
-    gained, truth = scores["warping_error_gain"], scores["warping_error_truth"]
-    return [f"warping error after the gain {gained:.5f}, of the truth {truth:.5f}"]
+    plain, gained = scores.get("warping_error"), scores.get("warping_error_gain")
+    if gained is not None:
+        return [f"warping error after the gain {gained:.5f}, of the truth {scores['warping_error_truth']:.5f}"]
+    return [] if plain is None else [f"warping error {plain:.5f}"]

@@ -33,8 +33,8 @@ def evaluate(
 ) -> dict:
     """Render every view of a split and compare it with the input and, if the scene has it, the well-lit ground truth.
 
-    Scores are means over the frames; docs/metrics.md defines them. A region's means are over the frames that show it,
-    and pixels that are not valid are left out everywhere.
+    Scores are means over the frames; docs/metrics.md defines them. A region's means are over the frames that show
+    enough of it for the score, and pixels that are not valid are left out everywhere.
 
     Args:
         run: the run.
@@ -190,6 +190,6 @@ def _compare(
     convention: Convention,
 ) -> dict[str, Score]:
     """Score a prediction of the frame `index`, clipped to [0, 1], in the regions that the split has masks of."""
-    clipped = np.clip(np.asarray(prediction, np.float32), 0, 1)
+    clipped = metrics.clipped(np.asarray(prediction, np.float32))
     masks = (None if x is None else x[index] for x in (split.masks, split.valid, split.covisible))
     return metrics.compare(clipped, truths[index].astype(np.float32), *masks, measures=measures, convention=convention)

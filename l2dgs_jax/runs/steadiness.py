@@ -41,7 +41,7 @@ def steadiness(welllit: Float[np.ndarray, "F H W 3"], split: Split, gain: float 
     flows, nothing = neighbour_flows(source), np.broadcast_to(np.float16(0), welllit.shape)
 
     def shown(video: Float[np.ndarray, "F H W 3"], index: int, factor: float) -> Float[np.ndarray, "H W 3"]:
-        image = np.clip(np.float32(factor) * video[index].astype(np.float32), 0, 1)
+        image = metrics.clipped(np.float32(factor) * video[index].astype(np.float32))
         return image if split.valid is None else np.where(split.valid[index][..., None], image, np.float32(np.nan))
 
     def score(frame: int, after: int) -> dict[str, Score]:

@@ -23,6 +23,7 @@ from l2dgs_jax.metrics.lpips import SMALLEST_SIDE
 from l2dgs_jax.runs.lpips_weights import load_lpips
 from l2dgs_jax.runs.views import views
 from l2dgs_jax.runtime import command_line
+from l2dgs_jax.training.flows import Flows
 
 
 @pytest.fixture(autouse=True)
@@ -333,6 +334,35 @@ def test_a_frame_with_nan_is_named_and_means_are_null(run, result, monkeypatch):
     assert found["dark_frame_gain"] == result["dark_frame_gain"]
     assert json.loads(json.dumps(found, allow_nan=False)) == found
     assert "gain unknown" in table(found)
+
+
+def test_a_single_infinite_value_leaves_its_frames_score_unknown(run, monkeypatch):
+    """A pixel without trusted flow: the warping error of the images as rendered is then known, the other is not."""
+
+    def spoiled(*arguments):
+        for output in views(*arguments):
+            images = output.images
+            welllit, lowlight = (np.array(x) for x in (images.welllit, images.lowlight))
+            welllit[0, 0, 0] = lowlight[0, 0, 0] = np.inf
+            yield output._replace(images=images._replace(welllit=welllit, lowlight=lowlight))
+
+    def untrusted(split):
+        height, width = split.images.shape[1:3]
+        displacements = np.zeros((len(split.names), 2, height, width, 2), np.float16)
+        displacements[..., 0, 0, :] = np.nan
+        following = np.minimum(np.arange(len(split.names)) + 1, len(split.names) - 1)
+        return Flows(following, displacements)
+
+    monkeypatch.setattr("l2dgs_jax.runs.scores.views", spoiled)
+    monkeypatch.setattr("l2dgs_jax.runs.steadiness.neighbour_flows", untrusted)
+    with pytest.warns(UserWarning, match="not finite, and without a score"):
+        found = evaluate(run)
+    assert found["lowlight"] == {"psnr": None, "ssim": None, "area": 1.0}
+    assert found["welllit"]["overall"]["psnr"] is None
+    scores = found["temporal"]["regions"]["overall"]
+    assert scores["warping_error"] is not None
+    assert scores["warping_error_gain"] is None
+    assert f"warping error {scores['warping_error']:.5f}" in table(found)
 
 
 def test_a_split_without_valid_pixels_is_refused(run):

@@ -225,6 +225,35 @@ def test_invalid_pixels_change_no_score():
         assert nothing == {}
 
 
+def test_values_that_are_not_finite_matter_only_where_pixels_are_valid():
+    prediction, truth, moving = next(frames())
+    valid = np.random.default_rng(1).random(moving.shape) < 0.8
+    measures = metrics.BASIC | {"ssim_3dgs": metrics.SSIM_3DGS, "flip": metrics.FLIP}
+    scores = metrics.compare(np.where(valid[..., None], prediction, 0), truth, moving, valid, measures=measures)
+    for wrong in (np.nan, np.inf):
+        spoiled = np.where(valid[..., None], prediction, wrong)
+        assert metrics.compare(spoiled, truth, moving, valid, measures=measures) == scores
+        spoiled = np.where(valid[..., None], wrong, prediction)
+        assert np.isnan(metrics.compare(spoiled, truth, moving, valid)["overall"]["psnr"])
+
+
+def test_clipped_keeps_infinite_values_apart():
+    values = np.float32([-1, 0.25, 2, np.inf, -np.inf, np.nan])
+    np.testing.assert_array_equal(metrics.clipped(values), np.float32([0, 0.25, 1, np.nan, np.nan, np.nan]))
+    assert metrics.clipped(values).dtype == np.float32
+
+
+def test_images_and_masks_of_integers_are_refused():
+    prediction, truth, moving = next(frames())
+    compare = metrics.compare.__wrapped__  # without the type checks that only tests have
+    with pytest.raises(ValueError, match="prediction: an image of uint8; expected floating-point values"):
+        compare((255 * prediction).astype(np.uint8), truth)
+    with pytest.raises(ValueError, match="truth: an image of uint8; expected floating-point values"):
+        compare(prediction, (255 * truth).astype(np.uint8))
+    with pytest.raises(ValueError, match="dynamic: a mask of uint8; expected booleans"):
+        compare(prediction, truth, moving.astype(np.uint8))
+
+
 def test_regions_of_a_partly_valid_frame_average_windows_of_valid_pixels():
     """If pixels that do not count were set equal instead, windows beside them would score too high."""
     prediction, truth = pair(3, 30, 40, 3)

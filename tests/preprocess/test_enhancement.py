@@ -64,10 +64,17 @@ def test_zero_dce_has_the_parameters_and_the_curve_of_its_paper():
     np.testing.assert_allclose(zero_dce.brighten(net, images), expected, rtol=1e-12)
 
 
-def test_the_objective_of_zero_dce_matches_a_value_computed_by_hand():
-    """With all parameters 0 the picture is unchanged, and only the terms of exposure and tint remain."""
-    net = jax.tree.map(jnp.zeros_like, zero_dce.init(jax.random.key(0)))
-    images = jnp.broadcast_to(jnp.asarray([0.1, 0.2, 0.4]), (2, 16, 16, 3))
-    tint = 0.1**2 + 0.2**2 + 0.3**2
-    expected = 10 * (0.7 / 3 - 0.6) ** 2 + 5 * tint
+def test_the_objective_of_zero_dce_matches_its_terms_in_numpy():
+    net = zero_dce.init(jax.random.key(0))
+    images = jnp.asarray(np.random.default_rng(0).uniform(0, 0.4, (2, 16, 16, 3)))
+    bright, curves = (np.asarray(f(net, images)) for f in (zero_dce.brighten, zero_dce.curves))
+    blocks = (bright - images).mean(-1).reshape(2, 4, 4, 4, 4).mean((2, 4))
+    steps = [[np.square(np.diff(x, axis=axis)) for axis in (1, 2)] for x in (blocks, curves)]
+    spatial = 2 * sum(x.mean() for x in steps[0])  # a step is one of both its blocks
+    smoothness = 2 * sum(x.sum(-1).mean() for x in steps[1])
+    exposure = np.square(bright.mean((1, 2, 3)) - 0.6).mean()
+    red, green, blue = bright.mean((1, 2)).T
+    color = np.mean((red - green) ** 2 + (red - blue) ** 2 + (green - blue) ** 2)
+    expected = 1 * spatial + 10 * exposure + 5 * color + 200 * smoothness
     np.testing.assert_allclose(zero_dce.loss(net, images), expected, rtol=1e-12)
+    assert min(spatial, 200 * smoothness) > 1e-3 * expected  # or a mistake in them would not show
