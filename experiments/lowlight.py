@@ -12,7 +12,7 @@ from typing import Any
 import tyro
 
 from experiments.published import LOWLIGHT
-from experiments.tables import Cells, Options, collect, over_scenes, table, trained, write
+from experiments.tables import Cells, Options, collect, over_scenes, scenes_by_region, table, trained, write
 from l2dgs_jax.runtime import command_line
 
 
@@ -31,7 +31,7 @@ def lowlight(scores: dict[str, Any]) -> Cells:
 def markdown(found: dict[str, dict[str, Cells]]) -> str:
     parts = [*found.items(), ("mean", over_scenes(found))]
     rows = [(f"{part}: {label}", [cells]) for part, methods in parts for label, cells in methods.items()]
-    return table([*rows, ("paper: L2DGS", [LOWLIGHT])])
+    return table([*rows, ("paper: L2DGS", [LOWLIGHT])]) + scenes_by_region(found)
 
 
 if __name__ == "__main__":

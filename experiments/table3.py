@@ -10,15 +10,27 @@ from collections.abc import Sequence
 import tyro
 
 from experiments.published import TABLE3
-from experiments.tables import WITH_GAIN, Cells, Options, collect, over_scenes, table, trained, welllit, write
+from experiments.tables import (
+    WITH_GAIN,
+    Cells,
+    Options,
+    collect,
+    over_scenes,
+    scenes_by_region,
+    table,
+    trained,
+    welllit,
+    write,
+)
 from l2dgs_jax.runtime import command_line
 
 
 def main(arguments: Sequence[str]) -> None:
     options = tyro.cli(Options, args=arguments)
     members = trained(options, "table3.toml")
-    found = over_scenes(collect(members, welllit))
-    write(options, "table3", members, {"rows": found, "paper": TABLE3}, markdown(found))
+    found = collect(members, welllit)
+    rows = over_scenes(found)
+    write(options, "table3", members, {"rows": rows, "paper": TABLE3}, markdown(rows) + scenes_by_region(found))
 
 
 def markdown(found: dict[str, Cells]) -> str:

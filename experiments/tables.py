@@ -26,7 +26,8 @@ from l2dgs_jax.study import report, running
 from l2dgs_jax.study.spec import Spec, read
 
 STUDIES = Path(__file__).parent / "studies"
-Cells = Mapping[str, Mapping[str, float | Sequence[float]]]  # scores by region and measure: one, or one for each seed
+# Scores by region and measure: one, or one for each seed, None where it has none; a list can end before the last seed.
+Cells = Mapping[str, Mapping[str, float | Sequence[float | None]]]
 
 TITLES = {
     "psnr": "PSNR",
@@ -111,23 +112,27 @@ def _quick(spec: Spec) -> Spec:
 
 
 def collect(members: Sequence[Member], cells: Callable[[dict[str, Any]], Cells]) -> dict[str, dict[str, Cells]]:
-    """Scores of the seeds that did not diverge, by scene and label.
+    """Scores of the seeds by scene and label, in the order of the seeds; those that diverged have none.
 
     Args:
         members: of a study.
         cells: selects the scores for a table from all scores of a member.
     """
     names, scenes = labels(members), report.scene_names(member["scene"] for member in members)
-    groups: dict[str, dict[str, list[Cells]]] = {}
+    seeds = sorted({member["varied"]["seed"] for member in members})
+    groups: dict[str, dict[str, dict[int, Cells]]] = {}
     for member in members:
-        group = groups.setdefault(scenes[member["scene"]], {}).setdefault(names[member["name"]], [])
+        group = groups.setdefault(scenes[member["scene"]], {}).setdefault(names[member["name"]], {})
         if member["ended"] == report.FINISHED:
-            group.append(cells(member["scores"]))
-    return {scene: {label: _listed(scores) for label, scores in rows.items()} for scene, rows in groups.items()}
+            group[member["varied"]["seed"]] = cells(member["scores"])
+    return {
+        scene: {label: _listed(group.get(seed, {}) for seed in seeds) for label, group in rows.items()}
+        for scene, rows in groups.items()
+    }
 
 
 def over_scenes(found: dict[str, dict[str, Cells]]) -> dict[str, Cells]:
-    """Means over the scenes for each seed, by label; none where a row lacks a scene that another row has.
+    """Means over the scenes for each seed that has them all, by label; none without such a seed.
 
     Otherwise a row that lacks a hard scene, because it diverged there, would look better than the others.
     """
@@ -141,10 +146,18 @@ def over_scenes(found: dict[str, dict[str, Cells]]) -> dict[str, Cells]:
     means: dict[str, dict[str, dict[str, list[float]]]] = {label: defaultdict(dict) for label in rows}
     for (region, measure), scenes in scored.items():
         for label in rows:
-            values = [found[scene].get(label, {}).get(region, {}).get(measure) for scene in scenes]
-            if None not in values:
-                means[label][region][measure] = _mean_over_scenes(values)
+            values: list[Any] = [found[scene].get(label, {}).get(region, {}).get(measure, ()) for scene in scenes]
+            seeds = [float(np.mean(scores)) for scores in zip(*values, strict=False) if None not in scores]
+            if seeds:
+                means[label][region][measure] = seeds
     return means
+
+
+def scenes_by_region(found: dict[str, dict[str, Cells]]) -> str:
+    """A line on how many scenes the means of `over_scenes` are over: those without masks only count for "overall"."""
+    scored = [{region for cells in rows.values() for region in cells} for rows in found.values()]
+    counts = {region: sum(region in regions for regions in scored) for region in REGIONS}
+    return f"\nScenes in the means: {', '.join(f'{region} {count}' for region, count in counts.items())}.\n"
 
 
 def welllit(scores: dict[str, Any]) -> Cells:
@@ -152,22 +165,16 @@ def welllit(scores: dict[str, Any]) -> Cells:
     return scores.get("welllit", {})
 
 
-def _listed(scores: Iterable[Cells]) -> Cells:
-    """The scores of all members, for each region and measure those of the members that have it."""
-    found: dict[str, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
-    for cells in scores:
+def _listed(seeds: Iterable[Mapping[str, Mapping[str, Any]]]) -> Cells:
+    """The scores of all seeds, for each region and measure that any of them has."""
+    found: dict[str, dict[str, list[float | None]]] = defaultdict(lambda: defaultdict(list))
+    for index, cells in enumerate(seeds):
         for region, measures in cells.items():
             for measure, value in measures.items():
                 if value is not None:
-                    found[region][measure].append(float(value))  # "Infinity" is a string in JSON
+                    scores = found[region][measure]
+                    scores += [None] * (index - len(scores)) + [float(value)]  # "Infinity" is a string in JSON
     return found
-
-
-def _mean_over_scenes(values: Sequence[Sequence[float]]) -> list[float]:
-    """Of each seed, or of the scenes' means if they do not have equally many seeds."""
-    if len({len(seeds) for seeds in values}) > 1:
-        values = [[float(np.mean(seeds))] for seeds in values]
-    return np.mean(values, 0).tolist()
 
 
 def table(rows: Sequence[tuple[str, Sequence[Cells]]], measures: Sequence[str] = MEASURES) -> str:
@@ -192,13 +199,13 @@ def table(rows: Sequence[tuple[str, Sequence[Cells]]], measures: Sequence[str] =
     return markdown.table_rows(lines)
 
 
-def _text(scores: float | Sequence[float] | None, measure: str) -> str:
+def _text(scores: float | Sequence[float | None] | None, measure: str) -> str:
     if scores is None:
         return "" if measure == "area" else "–"
-    if measure == "area":
-        return f"{np.mean(scores):.0%}"
-    published = np.ndim(scores) == 0  # with two decimals
-    return markdown.mean_and_spread(scores, min(DECIMALS[measure], 2) if published else DECIMALS[measure])
+    if not isinstance(scores, Sequence):
+        return markdown.mean_and_spread(scores, min(DECIMALS[measure], 2))  # published with two decimals
+    known = [score for score in scores if score is not None]
+    return f"{np.mean(known):.0%}" if measure == "area" else markdown.mean_and_spread(known, DECIMALS[measure])
 
 
 def write(options: Options, name: str, members: Sequence[Member], content: Any, text: str) -> None:

@@ -16,6 +16,7 @@ from l2dgs_jax.runtime.command_line import use_huge_pages
 
 BASELINES = Path(__file__).with_name("baselines")
 TOLERANCE = 1.3  # ratio to the baseline; smaller ones are noise, because machines are shared
+GROWTH_TOLERANCE = 0.1  # GiB more than the baseline, which is near 0, so that a ratio to it would say nothing
 
 
 @dataclass
@@ -47,6 +48,11 @@ def main() -> None:
     if options.check and not path.exists():
         raise SystemExit(f"error: {path} is missing; expected a baseline of this machine: make one with --update")
     baseline = json.loads(path.read_text()) if path.exists() else {"machine": here, "figures": {}}
+    kept = baseline["figures"].keys() - set(options.cases)
+    if options.update and kept and baseline["machine"] != here:
+        raise SystemExit(
+            f"error: {path} holds {', '.join(sorted(kept))} of other versions; expected --update with these cases too"
+        )
     print(json.dumps(here))
     if baseline["machine"] != here:
         print(f"the baseline has other versions: {json.dumps(baseline['machine'])}")
@@ -56,9 +62,8 @@ def main() -> None:
         figures = CASES[case]()
         report["figures"][case] = {name: round(value, 3) for name, value in figures.items()}
         for name, value in figures.items():
-            factor = slowdown(name, value, baseline["figures"].get(case, {}).get(name))
-            verdict = "" if factor is None else f"{factor:5.2f} of the baseline"
-            if factor is not None and factor > TOLERANCE:
+            verdict, is_worse = compare(name, value, baseline["figures"].get(case, {}).get(name))
+            if is_worse:
                 worse.append(f"{case} {name}")
                 verdict += "  <- worse"
             print(f"{case:12}{name:42}{value:12.3f}  {verdict}", flush=True)
@@ -78,11 +83,14 @@ def slug(machine: dict[str, str | int]) -> str:
     return re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")
 
 
-def slowdown(name: str, value: float, baseline: float | None) -> float | None:
-    """Time or memory as a multiple of the baseline's; None if there is none to compare with."""
-    if not baseline or not value:
-        return None
-    return baseline / value if name.endswith("_per_s") else value / baseline
+def compare(name: str, value: float, baseline: float | None) -> tuple[str, bool]:
+    """How a figure compares with its baseline, if it has one, and whether it is worse by more than the tolerance."""
+    if baseline is None:
+        return "", False
+    if name.endswith("growth_gib"):
+        return f"{value - baseline:+5.2f} GiB to the baseline", value - baseline > GROWTH_TOLERANCE
+    factor = baseline / value if name.endswith("_per_s") else value / baseline
+    return f"{factor:5.2f} of the baseline", factor > TOLERANCE
 
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
 import itertools
 import json
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import tyro
@@ -70,23 +71,29 @@ UNITS = {"_per_s": " a second", "_ms_per_million_pairs": " ms", "_ms": " ms", "_
 
 
 def markdown(title: str, figures: Figures) -> str:
-    """One of `TABLES` or `ACCELERATOR_TABLES`, as Markdown."""
-    rows = ["| | |", "|---|---|"]
+    """One of `TABLES` or `ACCELERATOR_TABLES`, as Markdown, with the rows that have figures; empty if none has."""
+    rows = []
     for label, where in (TABLES | ACCELERATOR_TABLES)[title].items():
         case, name = where.split()
-        rows.append(f"| {label} | {shown(name, figures[case][name])} |")
-    return "".join(f"{row}\n" for row in rows)
+        if name in figures.get(case, {}):
+            rows.append(f"| {label} | {shown(name, figures[case][name])} |")
+    return _lines(["| | |", "|---|---|"], rows)
 
 
 def larger_scenes(figures: Figures) -> str:
-    """A table with a row for each of `LARGE_SCENES` and each place of its frames."""
-    rows = ["| Gaussians | frames | size | frames lie in | step | peak |", "|---|---|---|---|---|---|"]
+    """A table with a row for each of `LARGE_SCENES` and each place of its frames; empty without figures."""
+    rows = []
     for size, place in itertools.product(LARGE_SCENES, FRAME_PLACES):
         count, frames, width, height = size
         name = scale_name(*size, place)
-        found = (shown(unit, figures["scale"][f"{name}{unit}"]) for unit in ("_ms", "_peak_gib"))
-        rows.append(f"| {count:,} | {frames:,} | {width}x{height} | {place} | {' | '.join(found)} |")
-    return "".join(f"{row}\n" for row in rows)
+        if f"{name}_ms" in figures.get("scale", {}):
+            found = (shown(unit, figures["scale"][f"{name}{unit}"]) for unit in ("_ms", "_peak_gib"))
+            rows.append(f"| {count:,} | {frames:,} | {width}x{height} | {place} | {' | '.join(found)} |")
+    return _lines(["| Gaussians | frames | size | frames lie in | step | peak |", "|---|---|---|---|---|---|"], rows)
+
+
+def _lines(heading: Sequence[str], rows: Sequence[str]) -> str:
+    return "".join(f"{row}\n" for row in (*heading, *rows)) if rows else ""
 
 
 def shown(name: str, value: float) -> str:
@@ -96,7 +103,7 @@ def shown(name: str, value: float) -> str:
 
 
 def main(baseline: tyro.conf.Positional[Path]) -> None:
-    """Print the tables.
+    """Print the tables, without rows for cases that have not been measured.
 
     Args:
         baseline: file that `run --update` has written.
@@ -106,7 +113,7 @@ def main(baseline: tyro.conf.Positional[Path]) -> None:
     tables = {title: markdown(title, figures) for title in (TABLES if on_cpu else ACCELERATOR_TABLES)}
     if on_cpu:
         tables["Larger scenes"] = larger_scenes(figures)
-    sys.stdout.write("\n".join(f"## {title}\n\n{table}" for title, table in tables.items()))
+    sys.stdout.write("\n".join(f"## {title}\n\n{table}" for title, table in tables.items() if table))
 
 
 if __name__ == "__main__":

@@ -1,11 +1,12 @@
 """`python -m experiments.quality.table STUDY...`: results of studies in tables of means and spreads over seeds.
 
 Each argument is a folder that `python -m l2dgs_jax.sweep` has filled, or a file of numbers that `--json FILE` has
-written. Each scene has a table, with a row for each combination of settings and a column for each score: the mean and,
-with several seeds, half the range over them. Members that diverged are named and left out. If there is only one
-combination of settings, there is one table with a row for each scene.
+written. Each scene has a table, with a row for each variant and combination of the settings that a study varies, and a
+column for each score: the mean and, with several seeds, half the range over them. Members that diverged are named and
+left out. If there is only one such combination, there is one table with a row for each scene.
 """
 
+import dataclasses
 import json
 import sys
 from collections.abc import Sequence
@@ -17,14 +18,15 @@ import numpy as np
 import tyro
 
 from experiments.markdown import mean_and_spread, table_rows
-from experiments.members import left_out
+from experiments.members import Member, left_out
+from l2dgs_jax.config import Config, overrides
 from l2dgs_jax.data.parsing import read_json
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.runtime import command_line
 from l2dgs_jax.runtime.files import write_json
-from l2dgs_jax.study import report
+from l2dgs_jax.study import report, running
 
-Row = tuple[tuple[str, str], ...]  # names and values of settings
+Row = tuple[tuple[str, str], ...]  # names and values of settings; the name of a variant is ""
 Found = dict[Row, dict[str, dict[str, list[float]]]]  # by settings, scene and name of a score: its values for all seeds
 SCORES = {
     "low": ("lowlight", "psnr"),
@@ -35,6 +37,7 @@ SCORES = {
     "moving gain": ("welllit", "dynamic", "psnr_gain"),
     "SSIM": ("welllit", "overall", "ssim"),
 }
+OWN_GAIN = " (own gain)"  # ends the name of a score that `report.own_gain` tells from the others
 
 
 @dataclass(frozen=True)
@@ -56,11 +59,20 @@ def collect(studies: Sequence[Path]) -> Found:
     """Scores of all studies together; members that diverged are named on standard error and left out.
 
     Raises:
-        UserError: a study cannot be read, or two have scores of the same settings on the same scene.
+        UserError: a study cannot be read, or two have scores of the same row on the same scene, or of the same row with
+            different settings. A file has no settings to compare.
     """
     found: Found = {}
+    trained: dict[Row, tuple[Path, Config]] = {}  # the first folder with the row, and its settings
     for study in studies:
-        for row, scenes in (_kept(study) if study.is_file() else _trained(study)).items():
+        if study.is_file():
+            new = _kept(study)
+        else:
+            members = read_json(study / report.JSON, "the results of a study")["members"]
+            for row, config in _settings(study, members).items():
+                _check_equal(row, (study, config), trained.setdefault(row, (study, config)))
+            new = _trained(study, members)
+        for row, scenes in new.items():
             rows = found.setdefault(row, {})
             for scene in scenes.keys() & rows.keys():
                 raise UserError(
@@ -70,21 +82,43 @@ def collect(studies: Sequence[Path]) -> Found:
     return found
 
 
-def _trained(study: Path) -> Found:
+def _settings(study: Path, members: Sequence[Member]) -> dict[Row, Config]:
+    """The settings of each row in a folder that `sweep` has filled, all with the same seed."""
+    path = study / running.PLANS_FILE
+    try:
+        configs = {plan["name"]: overrides.from_dict(plan["settings"]) for plan in json.loads(path.read_text())}
+        return {_row(member): dataclasses.replace(configs[member["name"]], seed=0) for member in members}
+    except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
+        raise UserError(
+            f"{path}: cannot be read ({error!r}); expected the members' settings, as sweep writes"
+        ) from None
+
+
+def _check_equal(row: Row, one: tuple[Path, Config], other: tuple[Path, Config]) -> None:
+    for name, values in overrides.differences([one[1], other[1]]).items():
+        raise UserError(
+            f"{one[0]}: {name} is {values[0]} for {_label(row)}, but {values[1]} in {other[0]}; "
+            "expected studies with the same settings, or with variants of other names"
+        )
+
+
+def _row(member: Member) -> Row:
+    variant = (("", member["variant"]),) if member["variant"] else ()
+    return (*variant, *((name, str(value)) for name, value in member["varied"].items() if name != "seed"))
+
+
+def _trained(study: Path, members: Sequence[Member]) -> Found:
     """The scores in a folder that `sweep` has filled."""
-    members = read_json(study / report.JSON, "the results of a study")["members"]
     for missing in left_out(members):
         print(f"{study}: {missing} is left out", file=sys.stderr)
     names = report.scene_names(member["scene"] for member in members)
     found: Found = {}
     for member in members:
-        varied = {name: value for name, value in member["varied"].items() if name != "seed"}
-        row = tuple((name, str(value)) for name, value in varied.items())
-        scores = found.setdefault(row, {}).setdefault(names[member["scene"]], {})
+        scores = found.setdefault(_row(member), {}).setdefault(names[member["scene"]], {})
         for name, path in SCORES.items() if member["ended"] == report.FINISHED else ():
             score = _score(member["scores"], path)
             if score is not None:
-                scores.setdefault(name, []).append(score)
+                scores.setdefault(name + OWN_GAIN * report.own_gain(member, path), []).append(score)
     return found
 
 
@@ -141,15 +175,16 @@ def _scenes(found: Found) -> list[str]:
 def _brief_cell(scores: dict[str, list[float]] | None) -> str:
     if not scores:
         return ""
-    low, gain, ssim = (
+    low, own, gain, ssim = (
         f"{np.mean(scores[name]):.{digits}f}" if name in scores else "–"
-        for name, digits in (("low", 1), ("gain", 1), ("SSIM", 2))
+        for name, digits in (("low", 1), ("low" + OWN_GAIN, 1), ("gain", 1), ("SSIM", 2))
     )
-    return f"{low}, {gain} / {ssim}"
+    return f"{low if own == '–' else own + OWN_GAIN}, {gain} / {ssim}"
 
 
 def _table(corner: str, rows: dict[str, dict[str, list[float]]]) -> str:
-    shown = [name for name in SCORES if any(name in scores for scores in rows.values())]
+    names = [name + ending for name in SCORES for ending in ("", OWN_GAIN)]
+    shown = [name for name in names if any(name in scores for scores in rows.values())]
     lines = [[corner, "seeds", *shown], ["---"] * (len(shown) + 2)]
     for label, scores in rows.items():
         seeds = max(map(len, scores.values()), default=0)

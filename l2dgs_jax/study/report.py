@@ -53,7 +53,10 @@ def scene_names(scenes: Iterable[str]) -> dict[str, str]:
 
 
 def markdown(members: Sequence[dict[str, Any]]) -> str:
-    """A table with a row for each member: what was varied, how it ended, and the scores that it has."""
+    """A table with a row for each member: what was varied, how it ended, and the scores that it has.
+
+    Low-light scores after gains of their own are marked, because they are higher than those without.
+    """
     names = scene_names(member["scene"] for member in members)
     variant = ["variant"] if any(member["variant"] for member in members) else []
     varied = list(dict.fromkeys(name for member in members for name in member["varied"]))
@@ -61,11 +64,10 @@ def markdown(members: Sequence[dict[str, Any]]) -> str:
     header = ["scene", *variant, *varied, "ended", "Gaussians", *shown]
     lines = [header, ["---"] * len(header)]
     for member in members:
-        scores = [_score(member, _SCORES[name]) for name in shown]
         cells = [names[member["scene"]], *(member[key] for key in variant)]
         cells += [*(_text(member["varied"].get(name)) for name in varied)]
         cells += [member["ended"], str(member["scores"]["gaussians"])]
-        lines.append(cells + ["" if score is None else f"{score:.3f}" for score in scores])
+        lines.append(cells + [_shown(member, _SCORES[name]) for name in shown])
     return "".join(f"| {' | '.join(cells)} |\n" for cells in lines)
 
 
@@ -74,6 +76,16 @@ def _score(member: dict[str, Any], path: Sequence[str]) -> float | None:
     for key in path:
         found = found.get(key) if isinstance(found, dict) else None
     return None if found is None else float(found)
+
+
+def own_gain(member: dict[str, Any], path: Sequence[str]) -> bool:
+    """Whether this is a low-light score of estimates that were each compared after the gain that suits it best."""
+    return path[0].startswith("lowlight") and member["scores"].get("lowlight_gain") == "own"
+
+
+def _shown(member: dict[str, Any], path: Sequence[str]) -> str:
+    score = _score(member, path)
+    return "" if score is None else f"{score:.3f}" + " (own gain)" * own_gain(member, path)
 
 
 def _text(value: Any) -> str:

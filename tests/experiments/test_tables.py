@@ -84,7 +84,7 @@ MEMBERS = [
 
 
 def rows_of(text):
-    lines = [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines() if line]
+    lines = [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines() if line.startswith("|")]
     return {name: cells for name, *cells in lines}
 
 
@@ -117,8 +117,29 @@ def test_a_row_that_lacks_a_scene_of_others_has_no_mean():
     means = tables.over_scenes(tables.collect(ended, tables.welllit))
     assert means["L2DGS"] == {}
     assert means["without_ssim"]["dynamic"]["psnr"] == [6.0, 8.0]
-    unequal = [one for one in MEMBERS if one is not lost[0]]
-    assert tables.over_scenes(tables.collect(unequal, tables.welllit))["L2DGS"]["dynamic"]["psnr"] == [6.5]
+
+
+@pytest.mark.parametrize("missing", ["left out", "diverged at step 7"])
+def test_means_over_scenes_are_over_seeds_that_all_scenes_have(missing):
+    scores = {("mochi", 1): 10.0, ("mochi", 2): 20.0, ("mine", 0): 0.0, ("mine", 1): 10.0}
+    members = [member(scene, "a", seed, psnr) for (scene, seed), psnr in scores.items()]
+    if missing != "left out":
+        members += [member(scene, "a", seed, 99.0, ended=missing) for scene, seed in (("mochi", 0), ("mine", 2))]
+    found = tables.collect(members, tables.welllit)
+    assert found["mochi"]["a"]["dynamic"]["psnr"] == [None, 10.0, 20.0]
+    assert found["mine"]["a"]["dynamic"]["psnr"] == [0.0, 10.0]
+    assert tables.over_scenes(found)["a"]["dynamic"]["psnr"] == [10.0]
+    assert rows_of(lowlight.markdown(found))["mochi: a"][0] == "15.0 ± 5.0"
+    apart = [one for one in members if one["varied"]["seed"] != 1]
+    assert tables.over_scenes(tables.collect(apart, tables.welllit)) == {"a": {}}
+
+
+def test_below_the_means_stands_how_many_scenes_have_each_region():
+    without_masks = member("street", "L2DGS", 0, 5.0)
+    without_masks["scores"]["welllit"] = {"overall": {"psnr": 5.0}}
+    diverged = member("dark", "L2DGS", 0, 5.0, ended="diverged at step 7")
+    found = tables.collect([*MEMBERS, without_masks, diverged], tables.welllit)
+    assert tables.scenes_by_region(found) == "\nScenes in the means: dynamic 2, static 2, overall 3.\n"
 
 
 def test_scenes_of_one_name_are_kept_apart():
@@ -177,7 +198,7 @@ def test_points_of_a_grid_have_separate_rows():
 def test_diverged_members_are_in_no_mean_and_are_named(tmp_path, capsys):
     diverged = [member("mochi", name, 1, 99.0, ended="diverged at step 7") for name in ("L2DGS", "without_exposure")]
     found = tables.collect([*MEMBERS, *diverged], tables.welllit)["mochi"]
-    assert found["L2DGS"]["dynamic"]["psnr"] == [0.0, 2.0]
+    assert found["L2DGS"]["dynamic"]["psnr"] == [0.0, None, 2.0]
     assert rows_of(tables.table([(name, [cells]) for name, cells in found.items()]))["without_exposure"] == ["–"] * 6
     tables.write(tables.Options(tmp_path), "t", [*MEMBERS, *diverged], {}, "the table\n")
     *_, convention, _, named, _, seeds = (tmp_path / "t.md").read_text().splitlines()

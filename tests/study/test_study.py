@@ -266,6 +266,18 @@ def test_the_table_shows_what_was_varied_and_scored(tmp_path):
     ]
 
 
+def test_low_light_scores_after_gains_of_their_own_are_marked():
+    scores = {"gaussians": 7, "lowlight": {"psnr": 30.0, "ssim": 0.9}, "welllit": {"overall": {"psnr": 20.0}}}
+    members = [
+        {"scene": gain, "variant": "", "varied": {}, "ended": "finished", "scores": scores | {"lowlight_gain": gain}}
+        for gain in ("none", "own")
+    ]
+    assert report.markdown(members).splitlines()[2:] == [
+        "| none | finished | 7 | 30.000 | 0.900 | 20.000 |",
+        "| own | finished | 7 | 30.000 (own gain) | 0.900 (own gain) | 20.000 |",
+    ]
+
+
 def test_scenes_are_called_by_as_much_of_their_paths_as_tells_them_apart():
     names = report.scene_names(["demo", "/data/toys", "/a/one/left", "/b/one/left", "/a/two/left", "/c/demo"])
     assert list(names.values()) == ["demo", "toys", "a/one/left", "b/one/left", "two/left", "c/demo"]
