@@ -76,8 +76,10 @@ def _chromium(profile, *options):
 @contextlib.contextmanager
 def opened(address, profile, size=(800, 500)):
     """A function that opens the address in another tab and returns it, driven through Chromium's DevTools protocol."""
-    options = ["--remote-debugging-port=0", "--enable-unsafe-swiftshader", "--use-angle=swiftshader", "about:blank"]
-    with _chromium(profile, *options):
+    options = ["--remote-debugging-port=0", "--enable-unsafe-swiftshader", "--use-angle=swiftshader"]
+    # With it, headless Chromium sometimes gives a page that is loaded again an empty localStorage.
+    options.append("--disable-features=RenderDocument")
+    with _chromium(profile, *options, "about:blank"):
         port = awaited(lambda: (profile / "DevToolsActivePort").read_text().split()[0])
         with contextlib.ExitStack() as stack:
 
