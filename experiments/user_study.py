@@ -11,7 +11,6 @@ that file to the participants. Scenes and letters are shown in an order that the
 import hashlib
 import json
 import sys
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -170,10 +169,8 @@ def _anonymous(path: Path) -> str:
     """A data URL: a picture's pixels without its metadata, or a video as it is."""
     if _container(path) != "picture":
         return data_url(path.read_bytes(), path.name)
-    with tempfile.TemporaryDirectory() as folder:
-        plain = Path(folder) / "picture.png"
-        images.write_image(plain, images.to_bytes(images.read_image(path)))
-        return data_url(plain.read_bytes(), plain.name)
+    _, content = cv2.imencode(".png", images.to_bytes(images.read_image(path))[..., ::-1])
+    return data_url(content.tobytes(), "picture.png")
 
 
 def _read_key(path: Path) -> dict[str, Any]:

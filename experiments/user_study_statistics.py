@@ -27,8 +27,9 @@ CRITERIA = (
 RATINGS = (1, 5)
 CONFIDENCE = 0.95
 METHOD = (
-    "95 % confidence intervals over people, by Student's t for a ratio of sums, or Clopper-Pearson's where all agree "
-    "on 0 or 100 %; none for fewer than two people, or where all gave the same mean otherwise"
+    f"{100 * CONFIDENCE:.0f} % confidence intervals over people, by Student's t for a ratio of sums, or "
+    "Clopper-Pearson's where all agree on 0 or 100 %; none for fewer than two people, or where all gave the same mean "
+    "otherwise"
 )
 
 Estimate = dict[str, float | None]

@@ -37,7 +37,6 @@ SCORES = {
     "moving gain": ("welllit", "dynamic", "psnr_gain"),
     "SSIM": ("welllit", "overall", "ssim"),
 }
-OWN_GAIN = " (own gain)"  # ends the name of a score that `report.own_gain` tells from the others
 
 
 @dataclass(frozen=True)
@@ -118,7 +117,7 @@ def _trained(study: Path, members: Sequence[Member]) -> Found:
         for name, path in SCORES.items() if member["ended"] == report.FINISHED else ():
             score = _score(member["scores"], path)
             if score is not None:
-                scores.setdefault(name + OWN_GAIN * report.own_gain(member, path), []).append(score)
+                scores.setdefault(name + report.OWN_GAIN * report.own_gain(member, path), []).append(score)
     return found
 
 
@@ -177,13 +176,13 @@ def _brief_cell(scores: dict[str, list[float]] | None) -> str:
         return ""
     low, own, gain, ssim = (
         f"{np.mean(scores[name]):.{digits}f}" if name in scores else "–"
-        for name, digits in (("low", 1), ("low" + OWN_GAIN, 1), ("gain", 1), ("SSIM", 2))
+        for name, digits in (("low", 1), ("low" + report.OWN_GAIN, 1), ("gain", 1), ("SSIM", 2))
     )
-    return f"{low if own == '–' else own + OWN_GAIN}, {gain} / {ssim}"
+    return f"{low if own == '–' else own + report.OWN_GAIN}, {gain} / {ssim}"
 
 
 def _table(corner: str, rows: dict[str, dict[str, list[float]]]) -> str:
-    names = [name + ending for name in SCORES for ending in ("", OWN_GAIN)]
+    names = [name + ending for name in SCORES for ending in ("", report.OWN_GAIN)]
     shown = [name for name in names if any(name in scores for scores in rows.values())]
     lines = [[corner, "seeds", *shown], ["---"] * (len(shown) + 2)]
     for label, scores in rows.items():

@@ -12,6 +12,7 @@ from l2dgs_jax.runtime.files import replacing, write_json
 JSON, MARKDOWN, PLOTS = "results.json", "results.md", "results.png"
 RESULT_FILE = "result.json"  # in the folder of a member
 FINISHED = "finished"  # "ended" of a member that did not diverge
+OWN_GAIN = " (own gain)"  # marks a score that `own_gain` tells from the others
 
 _SCORES = {
     "low-light PSNR": ("lowlight", "psnr"),
@@ -85,7 +86,7 @@ def own_gain(member: dict[str, Any], path: Sequence[str]) -> bool:
 
 def _shown(member: dict[str, Any], path: Sequence[str]) -> str:
     score = _score(member, path)
-    return "" if score is None else f"{score:.3f}" + " (own gain)" * own_gain(member, path)
+    return "" if score is None else f"{score:.3f}" + OWN_GAIN * own_gain(member, path)
 
 
 def _text(value: Any) -> str:
