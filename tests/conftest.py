@@ -1,6 +1,7 @@
 """Every test runs in float64 unless it says otherwise, with shapes and dtypes checked at run time."""
 
 import os
+import shutil
 from pathlib import Path
 
 # Most of a test's time is compilation, and most of that is optimisation. Whoever sets the variable decides.
@@ -17,6 +18,13 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 install_import_hook("l2dgs_jax", "beartype.beartype")
 
 MAPPINGS = Path("/proc/self/maps")
+
+
+@pytest.fixture(scope="session")
+def chromium():
+    """Whatever drives the browser is skipped where it is missing."""
+    if not shutil.which("chromium"):
+        pytest.skip("needs Chromium")
 
 
 @pytest.fixture(autouse=True, scope="module")

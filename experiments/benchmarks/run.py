@@ -45,9 +45,11 @@ def main() -> None:
     devices.one_per_core()
     here = machine()
     path = BASELINES / f"{slug(here)}.json"
-    if options.check and not path.exists():
-        raise SystemExit(f"error: {path} is missing; expected a baseline of this machine: make one with --update")
     baseline = json.loads(path.read_text()) if path.exists() else {"machine": here, "figures": {}}
+    lacking = set(options.cases) - baseline["figures"].keys()
+    if options.check and lacking:
+        names = ", ".join(sorted(lacking))
+        raise SystemExit(f"error: {path} has no {names}; expected a baseline of this machine: make it with --update")
     kept = baseline["figures"].keys() - set(options.cases)
     if options.update and kept and baseline["machine"] != here:
         raise SystemExit(

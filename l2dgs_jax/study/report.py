@@ -109,7 +109,9 @@ def _plot(path: Path, members: Sequence[dict[str, Any]], folder: Path) -> None:
         found = [_score(member, _SCORES[name]) for member in members]
         values = [score if score is not None and math.isfinite(score) else 0 for score in found]
         places = [index + 0.8 * offset / len(shown) for index in range(len(members))]
-        ends.barh(places, values, height=0.8 / len(shown), label=name)
+        bars = ends.barh(places, values, height=0.8 / len(shown), label=name)
+        marks = [OWN_GAIN * own_gain(member, _SCORES[name]) for member in members]
+        ends.bar_label(bars, marks, label_type="center", color="white", fontsize=6)
     ends.set(xlabel="held-out views, dB", yticks=range(len(members)))
     ends.set_yticklabels([member["name"] for member in members], fontsize=6)
     ends.invert_yaxis()

@@ -3,7 +3,6 @@
 import contextlib
 import dataclasses
 import os
-import shutil
 import signal
 import socket
 import subprocess
@@ -80,7 +79,7 @@ def changed(page, before):
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(shutil.which("chromium") is None, reason="needs Chromium")
+@pytest.mark.usefixtures("chromium")
 def test_a_browser_shows_what_its_controls_select(tmp_path):
     command = [sys.executable, "-m", "l2dgs_jax.view", str(varied_run(tmp_path)), "--port", "8917"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
@@ -121,7 +120,7 @@ def test_a_browser_shows_what_its_controls_select(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(shutil.which("chromium") is None, reason="needs Chromium")
+@pytest.mark.usefixtures("chromium")
 def test_a_browser_shows_the_progress_of_a_training(tmp_path):
     finished_run.folder(tmp_path)
     command = [sys.executable, "-m", "l2dgs_jax.train", str(tmp_path / "tiny_scene"), "--output", str(tmp_path / "run")]

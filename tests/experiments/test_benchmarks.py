@@ -104,6 +104,16 @@ def test_a_growth_from_nothing_is_found(benchmark, capsys):
     assert capsys.readouterr().err == "worse than the baseline: memory growth_gib\n"
 
 
+def test_a_check_needs_a_baseline_of_every_case(benchmark):
+    command, path = benchmark
+    path.write_text(json.dumps({"machine": HERE, "figures": {"step": {"small_ms": 3.0}}}))
+    with pytest.raises(SystemExit, match=r"one-2-cores\.json has no memory; expected a baseline"):
+        command("memory", "step", "--check")
+    path.unlink()
+    with pytest.raises(SystemExit, match="has no memory, step; expected"):
+        command("memory", "step", "--check")
+
+
 def test_figures_that_were_not_measured_again_keep_their_versions(benchmark):
     command, path = benchmark
     old = {"machine": HERE | {"jax": "1"}, "figures": {"memory": {"growth_gib": 0.0}}}

@@ -2,7 +2,6 @@
 
 import json
 import re
-import shutil
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -123,7 +122,7 @@ def test_an_output_that_cannot_be_written_is_refused_before_rendering(study, out
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not shutil.which("chromium"), reason="no browser")
+@pytest.mark.usefixtures("chromium")
 def test_time_curtain_and_enlargement_follow_the_controls(tmp_path):
     flat = lambda grey: _url(np.full((30, 40, 3), grey, np.uint8))
     pictures = {name: [flat(20 * k), flat(20 * k + 9)] for k, name in enumerate(("input", "a", "b", "truth"))}

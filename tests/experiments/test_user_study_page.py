@@ -176,10 +176,8 @@ def test_a_folder_unsuitable_for_a_study_is_refused(tmp_path, change, naming):
 
 
 @pytest.fixture
-def shown(tmp_path):
+def shown(tmp_path, chromium):
     """A page in a browser."""
-    if not shutil.which("chromium"):
-        pytest.skip("no browser")
     made(media(tmp_path / "media"), "night", "--seed", "3")
     with browser.opened((tmp_path / "night.html").as_uri(), tmp_path / "profile") as tab:
         page = tab()

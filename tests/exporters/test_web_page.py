@@ -4,7 +4,6 @@ import base64
 import dataclasses
 import json
 import re
-import shutil
 import time
 import zlib
 from html.parser import HTMLParser
@@ -97,11 +96,9 @@ def baked_page(run, tmp_path_factory):
 
 WIDTH, HEIGHT = 240, 180  # ten times what the scene was trained at
 
-needs_chromium = pytest.mark.skipif(not shutil.which("chromium"), reason="needs chromium")
-
 
 @pytest.fixture(scope="module")
-def visit(baked_page, tmp_path_factory):
+def visit(baked_page, tmp_path_factory, chromium):
     """A function that opens the page, paused and with nothing over the picture."""
     with browser.opened(baked_page[1].as_uri(), tmp_path_factory.mktemp("browser"), (WIDTH, HEIGHT)) as tab:
         yield lambda: paused(tab())
@@ -134,7 +131,6 @@ def stand_at(page, run, index):
 
 
 @pytest.mark.slow
-@needs_chromium
 def test_the_player_draws_as_the_rasterizer_does(run, baked_page, visit):
     page = visit()
     for index in (0, 3, 6):
@@ -153,7 +149,6 @@ def test_the_player_draws_as_the_rasterizer_does(run, baked_page, visit):
 
 
 @pytest.mark.slow
-@needs_chromium
 def test_the_page_shows_what_the_model_renders(run, visit):
     page = visit()
     camera = stand_at(page, run, 2)
@@ -168,7 +163,6 @@ def test_the_page_shows_what_the_model_renders(run, visit):
 
 
 @pytest.mark.slow
-@needs_chromium
 def test_controls_change_the_picture_and_reset_brings_it_back(visit):
     page = visit()
     page.says("document.getElementById('reset').click()")

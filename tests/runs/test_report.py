@@ -2,7 +2,6 @@
 
 import json
 import re
-import shutil
 import sys
 
 import numpy as np
@@ -170,7 +169,7 @@ def test_without_the_extra_tensorboard_is_refused_in_one_sentence(tmp_path, monk
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not shutil.which("chromium"), reason="Chromium is not installed")
+@pytest.mark.usefixtures("chromium")
 def test_a_browser_draws_the_page(tmp_path):
     display = Report(tmp_path)
     send_events(display, tmp_path, 0, 600)

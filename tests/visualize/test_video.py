@@ -1,6 +1,5 @@
 """Videos written by the package, read by other decoders and played by a browser."""
 
-import shutil
 import sys
 
 import av
@@ -133,7 +132,7 @@ def test_the_video_of_a_run_moves(tmp_path, tmp_path_factory):
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not shutil.which("chromium"), reason="needs chromium")
+@pytest.mark.usefixtures("chromium")
 def test_a_browser_plays_a_video_to_the_end_in_its_colours(tmp_path, decode):
     colour = [200, 60, 30]
     path = write(tmp_path / "video", [np.full((64, 96, 3), colour, np.uint8)] * 12)
