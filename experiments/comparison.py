@@ -56,7 +56,7 @@ def main(arguments: Sequence[str]) -> None:
     if options.views < 1:
         raise UserError(f"--views {options.views}: expected at least 1")
     if not takes_file(options.output):
-        raise UserError(f"{options.output}: cannot be written; expected a file in an existing folder")
+        raise UserError(f"{options.output}: cannot be written; expected a file in a writable folder")
     scenes = _members(options.study)
     names = report.scene_names(scenes)
     shown = [_scene(options.study, names[scene], members, options.views) for scene, members in scenes.items()]

@@ -49,7 +49,7 @@ def main(arguments: Sequence[str]) -> None:
     """Evaluate as the command line says."""
     options = command_line.parse(Evaluate, arguments, "evaluate")
     if options.json and not takes_file(options.json):
-        raise UserError(f"--json {options.json}: cannot be written; expected a file in an existing folder")
+        raise UserError(f"--json {options.json}: cannot be written; expected a file in a writable folder")
     lpips = find_lpips({"alex": options.lpips_alex, "vgg": options.lpips_vgg})
     run = open_run(options.run, options.stage)
     result = evaluate(run, options.split, lpips=lpips, convention=options.region_convention)

@@ -54,7 +54,7 @@ def main(arguments: Sequence[str]) -> None:
     if not os.access(options.scene, os.W_OK):
         raise UserError(f"{options.scene}: cannot be written; expected a writable folder to put masks in")
     if options.preview and not takes_file(options.preview):
-        raise UserError(f"--preview {options.preview}: cannot be written; expected a file in an existing folder")
+        raise UserError(f"--preview {options.preview}: cannot be written; expected a file in a writable folder")
     if options.preview and options.preview.suffix.lower() not in SUFFIXES:
         raise UserError(f"--preview {options.preview}: not a picture's suffix; expected one of {', '.join(SUFFIXES)}")
     for note in dataset.notes:

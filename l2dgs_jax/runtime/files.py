@@ -157,8 +157,8 @@ def is_writable(folder: Path) -> bool:
 
 
 def takes_file(path: Path) -> bool:
-    """Whether `replacing` can write to `path`: no folder or device is there, and the folder around it exists."""
-    return path.parent.is_dir() and (path.is_file() or not path.exists())
+    """Whether `replacing` can write to `path`: no folder or device is there, and the folder around it takes files."""
+    return path.parent.is_dir() and is_writable(path.parent) and (path.is_file() or not path.exists())
 
 
 def is_taken(path: Path) -> bool:

@@ -1,14 +1,18 @@
 """The tracks that are surely of moving things, and where these begin and end."""
 
+from typing import NamedTuple
+
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Shaped
 
 from l2dgs_jax.cameras.geometry import project_points
 from l2dgs_jax.data.dataset import Split
-from l2dgs_jax.training.backdrop import Backdrop, depths_at, unprojected
+from l2dgs_jax.data.stacks import MappedArray, stacked
+from l2dgs_jax.training.backdrop import Backdrop, Cameras, Depths, depths_at, unprojected
 from l2dgs_jax.training.background import likeness_to_background
 from l2dgs_jax.training.flows import Flows, neighbour_flows
 from l2dgs_jax.training.tracks import MIN_DEVIATION, Tracks, by_track, find_tracks, followed_back, in_order
+from l2dgs_jax.types import Camera
 
 MIN_LENGTH = 3  # frames that a track must be seen in
 MIN_MOVING_SHARE = 0.4  # share of these frames in which it must be seen to move
@@ -16,19 +20,71 @@ MIN_DEPARTURE = 3.0  # pixels that a track must at some time be away from where 
 # Pixels by which what sets off slowly deviates in its first step; tracks begin where it is more than MIN_DEVIATION.
 # What is faster at first has come out from behind something, or into the picture.
 MAX_START = 1.5
+MIN_GROWTH = 1.2  # factor by which tracks must cover more of the clip for every second instant to be left out
+MIN_INSTANTS = 30  # that must remain
 
 
-def moving_tracks(split: Split, backdrop: Backdrop, most: int) -> Tracks:
+class Followed(NamedTuple):
+    """Tracks, and the frames that they were found in.
+
+    Attributes:
+        split: the frames.
+        backdrop: the static scene behind.
+        tracks: of what moves.
+    """
+
+    split: Split
+    backdrop: Backdrop
+    tracks: Tracks
+
+
+def moving_tracks(split: Split, backdrop: Backdrop, most: int) -> Followed:
     """Tracks of what surely moves, from before it sets off until it rests; none where no flow can be trusted.
+
+    Slow motion, or many frames a second, move things by less from frame to frame than flow errs. If tracks between
+    every second instant cover much more, the other instants are left out, and so on with every fourth or eighth.
 
     Args:
         split: the frames.
         backdrop: the static scene behind.
         most: how many tracks there may be; the longest ones are preferred.
     """
+    best = followed = Followed(split, backdrop, _among(split, backdrop, most))
+    while len(instants := np.unique(followed.backdrop.cameras.time)) >= 2 * MIN_INSTANTS:
+        kept = np.flatnonzero(np.isin(followed.backdrop.cameras.time, instants[::2]))
+        fewer = _frames(followed.split, kept), _backdrop(followed.backdrop, kept)
+        followed = Followed(*fewer, _among(*fewer, most))
+        covered, before = (len(x.tracks.numbers) / len(x.split.names) for x in (followed, best))
+        if covered > MIN_GROWTH * before:
+            best = followed
+        elif before:
+            break
+    return best
+
+
+def _among(split: Split, backdrop: Backdrop, most: int) -> Tracks:
     flows = neighbour_flows(split)
     chosen = surely_moving(find_tracks(split, flows, backdrop.depths.still), backdrop, most)
     return until_rest(from_rest(chosen, flows, split, backdrop), split, backdrop)
+
+
+def _frames(split: Split, kept: Int[np.ndarray, " N"]) -> Split:
+    """Some of the frames, with what is needed to follow and place what moves."""
+
+    def some(stack: Shaped[np.ndarray, "F ..."] | None) -> Shaped[np.ndarray, "N ..."] | None:
+        if stack is None:
+            return None
+        shape = (len(kept), *stack.shape[1:])
+        return stacked((stack[i] for i in kept), shape, stack.dtype, isinstance(stack, MappedArray))
+
+    names, cameras = tuple(split.names[i] for i in kept), Camera(*(x[kept] for x in split.cameras))
+    return Split(names, cameras, some(split.images), valid=some(split.valid), depths=some(split.depths))
+
+
+def _backdrop(backdrop: Backdrop, kept: Int[np.ndarray, " N"]) -> Backdrop:
+    """That of some of the frames."""
+    cameras, (still, hidden), ground = backdrop
+    return Backdrop(Cameras(*(x[kept] for x in cameras)), Depths(still[:, kept], hidden[kept]), ground)
 
 
 def surely_moving(tracks: Tracks, backdrop: Backdrop, most: int) -> Tracks:

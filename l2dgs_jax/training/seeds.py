@@ -46,9 +46,9 @@ def find_seeds(points: Float[np.ndarray, "P 3"], split: Split, knots: int, most:
     """
     height, width = split.images.shape[1:3]
     backdrop = find_backdrop(points, split.cameras, height, width)
+    split, backdrop, chosen = moving_tracks(split, backdrop, most)
     cameras = backdrop.cameras
     weights = np.asarray(path_weights(jnp.asarray(cameras.time), knots))
-    chosen = moving_tracks(split, backdrop, most)
     if not len(chosen.numbers):
         shapes = ((0, 3), (0, 3), (0,), (0, knots, 3), (0, 2))
         return Seeds(*(np.zeros(shape, np.float32) for shape in shapes))

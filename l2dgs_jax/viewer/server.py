@@ -57,10 +57,12 @@ def check(host: str, port: int, prefix: str = "") -> None:
     extra("viser", "view", "viewing")
     if not 1 <= port <= 65535:
         raise UserError(f"--{prefix}port {port}: expected a number from 1 to 65535")
+    what = "an address of this machine, or 0.0.0.0"
+    if not host:  # which Python takes for all addresses
+        raise UserError(f"--{prefix}host '': is empty; expected {what}")
     try:
         socket.create_server((host, 0)).close()
     except OSError as error:
-        what = "an address of this machine, or 0.0.0.0"
         raise UserError(f"--{prefix}host {host}: {error.strerror}; expected {what}") from None
     if not any(_is_free(host, candidate) for candidate in range(port, 65536)):
         raise UserError(f"--{prefix}port {port}: is in use, and so are all above it; expected another port")

@@ -263,7 +263,7 @@ def test_a_separate_process_in_single_precision_gives_the_same_scores(base, resu
             ["{run}", "--json", "{missing}/scores.json"],
             "scores.json: cannot be written; expected a file in an existing",
         ),
-        (["{run}", "--json", "{empty}"], "empty: cannot be written; expected a file in an existing folder"),
+        (["{run}", "--json", "{empty}"], "empty: cannot be written; expected a file in a writable folder"),
         (
             ["{run}", "--lpips-alex", "{missing}.npz"],
             "missing.npz: cannot be read (No such file or directory); expected",

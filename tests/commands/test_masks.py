@@ -2,6 +2,7 @@
 
 import os
 import shutil
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -143,13 +144,29 @@ def test_a_failure_midway_leaves_the_scene_as_it_was(scene, monkeypatch):
     assert sorted(path.name for path in scene.iterdir()) == ["camera", "dataset.json", "mask", "points.npy", "rgb"]
 
 
+def test_an_interruption_between_both_renames_leaves_the_old_masks(tmp_path, monkeypatch):
+    write_image(tmp_path / "mask" / "1x" / "a.png", np.zeros((3, 3)))
+    before, rename = files(tmp_path), os.rename
+
+    def interrupted(source, target):
+        if Path(source).name == "new":
+            raise KeyboardInterrupt
+        rename(source, target)
+
+    monkeypatch.setattr(os, "rename", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        write_masks(tmp_path / "mask", ["a"], [np.ones((3, 3), bool)])
+    assert files(tmp_path) == before
+    assert [path.name for path in tmp_path.iterdir()] == ["mask"]
+
+
 def test_invalid_input_gives_one_sentence_before_any_work(scene, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(masks, "compute_masks", lambda dataset: pytest.fail("too late"))
     monkeypatch.chdir(tmp_path)  # where no folder is called "demo"
     assert "no such folder" in error_of(capsys, [tmp_path / "missing"])
     assert "no folder to write masks to" in error_of(capsys, ["demo"])
     assert "not a picture's suffix" in error_of(capsys, [scene, "--preview", tmp_path / "preview.txt"])
-    assert "expected a file in an existing folder" in error_of(capsys, [scene, "--preview", tmp_path / "no" / "x.png"])
+    assert "expected a file in a writable folder" in error_of(capsys, [scene, "--preview", tmp_path / "no" / "x.png"])
     monkeypatch.setattr(os, "access", lambda path, mode: False)
     assert "cannot be written; expected a writable folder" in error_of(capsys, [scene])
     monkeypatch.undo()

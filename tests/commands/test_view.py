@@ -36,6 +36,7 @@ def test_mistakes_are_reported_in_one_sentence(tmp_path, capsys, monkeypatch):
     folder = finished_run.folder(tmp_path)
     assert "--port 0: expected a number" in error_message(capsys, folder, "--port", 0)
     assert "--host 192.0.2.1: " in error_message(capsys, folder, "--host", "192.0.2.1")
+    assert "--host '': is empty; expected an address" in error_message(capsys, folder, "--host", "")
     with contextlib.suppress(OSError), socket.create_server(("127.0.0.1", 65535)):  # if it is taken, so much the better
         assert "--port 65535: is in use" in error_message(capsys, folder, "--port", 65535)
     assert "not a training run" in error_message(capsys, tmp_path)

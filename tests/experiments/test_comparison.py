@@ -117,7 +117,7 @@ def test_mistakes_are_refused(tmp_path, results, arguments, naming):
 @pytest.mark.parametrize("output", ["no/page.html", ""])
 def test_an_output_that_cannot_be_written_is_refused_before_rendering(study, output):
     folder = study(member("missing"))
-    with pytest.raises(UserError, match="expected a file in an existing folder"):
+    with pytest.raises(UserError, match="expected a file in a writable folder"):
         comparison.main([str(folder), str(folder / output)])
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from l2dgs_jax.errors import DISK_FULL, UserError
-from l2dgs_jax.runtime.files import append_line, is_writable, new_folder, replacing, write_json
+from l2dgs_jax.runtime.files import append_line, is_writable, new_folder, replacing, takes_file, write_json
 
 
 def test_a_file_is_replaced_whole_or_not_at_all(tmp_path):
@@ -77,6 +77,16 @@ def test_files_can_be_created_in_folders_that_are_missing_but_not_below_files(tm
     assert is_writable(tmp_path / "new" / "newer")
     assert not is_writable(tmp_path / "file")
     assert not is_writable(tmp_path / "file" / "new")
+
+
+def test_a_file_needs_a_folder_that_can_be_written_to(tmp_path, monkeypatch):
+    (tmp_path / "old.json").write_text("")
+    assert takes_file(tmp_path / "new.json")
+    assert takes_file(tmp_path / "old.json")
+    assert not takes_file(tmp_path)
+    assert not takes_file(tmp_path / "missing" / "new.json")
+    monkeypatch.setattr(os, "access", lambda path, mode: False)
+    assert not takes_file(tmp_path / "new.json")
 
 
 def test_a_name_that_is_too_long_is_reported_in_one_sentence(tmp_path):

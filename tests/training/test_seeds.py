@@ -21,6 +21,8 @@ from l2dgs_jax.model.initialisation import Seeds, path_knots
 from l2dgs_jax.runs import checkpoints
 from l2dgs_jax.runs.checkpoints import Checkpoint
 from l2dgs_jax.training import initial_state
+from l2dgs_jax.training.backdrop import find_backdrop
+from l2dgs_jax.training.moving_tracks import moving_tracks
 from l2dgs_jax.training.seeds import find_seeds
 from l2dgs_jax.training.state import with_capacity
 from l2dgs_jax.training.step import densify
@@ -104,6 +106,26 @@ def test_what_moves_by_half_its_size_or_more_from_frame_to_frame_is_covered(ever
     seeds = find_seeds(surfaces(), few, KNOTS, MANY)
     for index, square in enumerate(squares[::every]):
         assert covered_share(square, places(seeds, few, index)) > 0.9
+
+
+@pytest.mark.parametrize(("speed", "step"), [(0.7, 2), (2.5, 1)])
+def test_slow_things_are_followed_between_instants_further_apart(speed, step):
+    """Speeds in pixels a frame, of which flow does not tell the lower one from its errors."""
+    count, unit = 60, 73  # frames; pixels that the square moves by if it moves by 1
+    heights = 0.8 - speed / unit * np.arange(count)
+    views = [camera(0.2 * (2 * i / (count - 1) - 1)) for i in range(count)]
+    pictures, squares = zip(*(render(view, height) for view, height in zip(views, heights, strict=True)), strict=True)
+    images = 0.2 * np.stack(pictures) + np.random.default_rng(0).normal(0, 0.004, (count, HEIGHT, WIDTH, 3))
+    times = np.linspace(0, 1, count, dtype=np.float32)
+    cameras = Camera(np.stack(views).astype(np.float32), np.tile(K, (count, 1, 1)), times)
+    split = Split(tuple(map(str, range(count))), cameras, np.clip(images, 0, 1).astype(np.float16))
+    found, backdrop, tracks = moving_tracks(split, find_backdrop(surfaces(), cameras, HEIGHT, WIDTH), MANY)
+    assert found.names == split.names[::step]
+    np.testing.assert_array_equal(backdrop.cameras.viewmat, np.float64(found.cameras.viewmat))
+    for frame in (10, 24):
+        columns, rows = tracks.pixels[tracks.frames == frame // step].astype(int).T
+        assert cv2.dilate(squares[frame].astype(np.uint8), np.ones((9, 9), np.uint8))[rows, columns].mean() > 0.85
+        assert covered_share(squares[frame], (rows, columns)) > 0.85
 
 
 def test_what_sets_off_slowly_is_followed_back_to_where_it_rested():

@@ -67,9 +67,14 @@ def write_masks(folder: Path, names: Sequence[str], masks: Sequence[Bool[np.ndar
                 path = new / "1x" / f"{name}.png"
                 path.parent.mkdir(parents=True, exist_ok=True)
                 write_image(path, 255 * mask.astype(np.uint8))
-            if folder.exists():
-                os.rename(folder, old)
-            os.rename(new, folder)
+            try:
+                if folder.exists():
+                    os.rename(folder, old)
+                os.rename(new, folder)
+            except BaseException:  # or the old masks would be removed with the temporary folder
+                if old.exists():
+                    os.rename(old, folder)
+                raise
     except OSError as error:
         raise UserError(f"{folder}: cannot be written ({error.strerror}); expected a writable folder") from None
 
