@@ -71,14 +71,13 @@ def _among(split: Split, backdrop: Backdrop, most: int) -> Tracks:
 def _frames(split: Split, kept: Int[np.ndarray, " N"]) -> Split:
     """Some of the frames, with what is needed to follow and place what moves."""
 
-    def some(stack: Shaped[np.ndarray, "F ..."] | None) -> Shaped[np.ndarray, "N ..."] | None:
-        if stack is None:
-            return None
+    def some(stack: Shaped[np.ndarray, "F ..."]) -> Shaped[np.ndarray, "N ..."]:
         shape = (len(kept), *stack.shape[1:])
         return stacked((stack[i] for i in kept), shape, stack.dtype, isinstance(stack, MappedArray))
 
     names, cameras = tuple(split.names[i] for i in kept), Camera(*(x[kept] for x in split.cameras))
-    return Split(names, cameras, some(split.images), valid=some(split.valid), depths=some(split.depths))
+    valid, depths = (None if x is None else some(x) for x in (split.valid, split.depths))
+    return Split(names, cameras, some(split.images), valid=valid, depths=depths)
 
 
 def _backdrop(backdrop: Backdrop, kept: Int[np.ndarray, " N"]) -> Backdrop:
