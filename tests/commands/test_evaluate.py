@@ -261,7 +261,7 @@ def test_a_separate_process_in_single_precision_gives_the_same_scores(base, resu
         (["{empty}"], "empty: not a training run; expected a folder with config.json"),
         (
             ["{run}", "--json", "{missing}/scores.json"],
-            "scores.json: cannot be written; expected a file in an existing",
+            "scores.json: cannot be written; expected a file in a writable",
         ),
         (["{run}", "--json", "{empty}"], "empty: cannot be written; expected a file in a writable folder"),
         (
