@@ -52,6 +52,11 @@ class Backdrop(NamedTuple):
     depths: Depths
     ground: Ground | None
 
+    def of(self, frames: Int[np.ndarray, " N"]) -> "Backdrop":
+        """That of some of the frames."""
+        depths = Depths(self.depths.still[:, frames], self.depths.hidden[frames])
+        return Backdrop(Cameras(*(x[frames] for x in self.cameras)), depths, self.ground)
+
 
 def find_backdrop(points: Float[np.ndarray, "P 3"], camera: Camera, height: int, width: int) -> Backdrop:
     """The backdrop of frames of that size, of points in world units."""

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int, Shaped
 from l2dgs_jax.cameras.geometry import project_points
 from l2dgs_jax.data.dataset import Split
 from l2dgs_jax.data.stacks import MappedArray, stacked
-from l2dgs_jax.training.backdrop import Backdrop, Cameras, Depths, depths_at, unprojected
+from l2dgs_jax.training.backdrop import Backdrop, depths_at, unprojected
 from l2dgs_jax.training.background import likeness_to_background
 from l2dgs_jax.training.flows import Flows, neighbour_flows
 from l2dgs_jax.training.tracks import MIN_DEVIATION, Tracks, by_track, find_tracks, followed_back, in_order
@@ -50,9 +50,9 @@ def moving_tracks(split: Split, backdrop: Backdrop, most: int) -> Followed:
         most: how many tracks there may be; the longest ones are preferred.
     """
     best = followed = Followed(split, backdrop, _among(split, backdrop, most))
-    while len(instants := np.unique(followed.backdrop.cameras.time)) >= 2 * MIN_INSTANTS:
-        kept = np.flatnonzero(np.isin(followed.backdrop.cameras.time, instants[::2]))
-        fewer = _frames(followed.split, kept), _backdrop(followed.backdrop, kept)
+    while len(instants := np.unique(times := followed.backdrop.cameras.time)) >= 2 * MIN_INSTANTS:
+        kept = np.flatnonzero(np.isin(times, instants[::2]))
+        fewer = _frames(followed.split, kept), followed.backdrop.of(kept)
         followed = Followed(*fewer, _among(*fewer, most))
         covered, before = (len(x.tracks.numbers) / len(x.split.names) for x in (followed, best))
         if covered > MIN_GROWTH * before:
@@ -78,12 +78,6 @@ def _frames(split: Split, kept: Int[np.ndarray, " N"]) -> Split:
     names, cameras = tuple(split.names[i] for i in kept), Camera(*(x[kept] for x in split.cameras))
     valid, depths = (None if x is None else some(x) for x in (split.valid, split.depths))
     return Split(names, cameras, some(split.images), valid=valid, depths=depths)
-
-
-def _backdrop(backdrop: Backdrop, kept: Int[np.ndarray, " N"]) -> Backdrop:
-    """That of some of the frames."""
-    cameras, (still, hidden), ground = backdrop
-    return Backdrop(Cameras(*(x[kept] for x in cameras)), Depths(still[:, kept], hidden[kept]), ground)
 
 
 def surely_moving(tracks: Tracks, backdrop: Backdrop, most: int) -> Tracks:

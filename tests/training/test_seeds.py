@@ -55,6 +55,17 @@ def filmed(block):
     return Split(tuple(map(str, range(COUNT))), cameras, np.stack(pictures).astype(np.float16)), squares
 
 
+def filmed_at(heights, reach):
+    """The moving square at these heights, one a frame, seen along a part of the camera's arc; and where it is."""
+    count = len(heights)
+    views = [camera(reach * (2 * i / (count - 1) - 1)) for i in range(count)]
+    pictures, squares = zip(*(render(view, height) for view, height in zip(views, heights, strict=True)), strict=True)
+    images = 0.2 * np.stack(pictures) + np.random.default_rng(0).normal(0, 0.004, (count, HEIGHT, WIDTH, 3))
+    times = np.linspace(0, 1, count, dtype=np.float32)
+    cameras = Camera(np.stack(views).astype(np.float32), np.tile(K, (count, 1, 1)), times)
+    return Split(tuple(map(str, range(count))), cameras, np.clip(images, 0, 1).astype(np.float16)), squares
+
+
 @functools.cache
 def found():
     return find_seeds(surfaces(), filmed(block=True)[0], KNOTS, MANY)
@@ -112,14 +123,8 @@ def test_what_moves_by_half_its_size_or_more_from_frame_to_frame_is_covered(ever
 def test_slow_things_are_followed_between_instants_further_apart(speed, step):
     """Speeds in pixels a frame, of which flow does not tell the lower one from its errors."""
     count, unit = 60, 73  # frames; pixels that the square moves by if it moves by 1
-    heights = 0.8 - speed / unit * np.arange(count)
-    views = [camera(0.2 * (2 * i / (count - 1) - 1)) for i in range(count)]
-    pictures, squares = zip(*(render(view, height) for view, height in zip(views, heights, strict=True)), strict=True)
-    images = 0.2 * np.stack(pictures) + np.random.default_rng(0).normal(0, 0.004, (count, HEIGHT, WIDTH, 3))
-    times = np.linspace(0, 1, count, dtype=np.float32)
-    cameras = Camera(np.stack(views).astype(np.float32), np.tile(K, (count, 1, 1)), times)
-    split = Split(tuple(map(str, range(count))), cameras, np.clip(images, 0, 1).astype(np.float16))
-    found, backdrop, tracks = moving_tracks(split, find_backdrop(surfaces(), cameras, HEIGHT, WIDTH), MANY)
+    split, squares = filmed_at(0.8 - speed / unit * np.arange(count), reach=0.2)
+    found, backdrop, tracks = moving_tracks(split, find_backdrop(surfaces(), split.cameras, HEIGHT, WIDTH), MANY)
     assert found.names == split.names[::step]
     np.testing.assert_array_equal(backdrop.cameras.viewmat, np.float64(found.cameras.viewmat))
     for frame in (10, 24):
@@ -131,11 +136,7 @@ def test_slow_things_are_followed_between_instants_further_apart(speed, step):
 def test_what_sets_off_slowly_is_followed_back_to_where_it_rested():
     rest, acceleration, fastest = 5, 0.015, 0.09  # frames at rest; then how much faster a frame, up to what speed
     heights = 0.5 - np.cumsum(np.clip(acceleration * (np.arange(COUNT) - rest + 1), 0, fastest))
-    views = [camera(0.1 * (2 * i / (COUNT - 1) - 1)) for i in range(COUNT)]
-    pictures, squares = zip(*(render(view, height) for view, height in zip(views, heights, strict=True)), strict=True)
-    images = 0.2 * np.stack(pictures) + np.random.default_rng(0).normal(0, 0.004, (COUNT, HEIGHT, WIDTH, 3))
-    cameras = Camera(np.stack(views).astype(np.float32), *filmed(block=True)[0].cameras[1:])
-    split = Split(tuple(map(str, range(COUNT))), cameras, np.clip(images, 0, 1).astype(np.float16))
+    split, squares = filmed_at(heights, reach=0.1)
     seeds = find_seeds(surfaces(), split, KNOTS, MANY)
     for frame in (0, rest - 2):
         at = places(seeds, split, frame)
