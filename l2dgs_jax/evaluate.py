@@ -9,7 +9,7 @@ import tyro
 
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.metrics import Convention
-from l2dgs_jax.runs import open_run
+from l2dgs_jax.runs import is_needed, open_run
 from l2dgs_jax.runs.lpips_weights import find_lpips
 from l2dgs_jax.runs.score_table import table
 from l2dgs_jax.runs.scores import evaluate
@@ -50,6 +50,8 @@ def main(arguments: Sequence[str]) -> None:
     options = command_line.parse(Evaluate, arguments, "evaluate")
     if options.json and not takes_file(options.json):
         raise UserError(f"--json {options.json}: cannot be written; expected a file in a writable folder")
+    if options.json and is_needed(options.json, options.run):
+        raise UserError(f"--json {options.json}: a file of the run itself; expected another one")
     lpips = find_lpips({"alex": options.lpips_alex, "vgg": options.lpips_vgg})
     run = open_run(options.run, options.stage)
     result = evaluate(run, options.split, lpips=lpips, convention=options.region_convention)

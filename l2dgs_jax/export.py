@@ -18,7 +18,7 @@ from l2dgs_jax.exporters.camera_path import camera_path
 from l2dgs_jax.exporters.model_arrays import model_arrays
 from l2dgs_jax.exporters.splats import Splats, visible
 from l2dgs_jax.exporters.tracks import quantise
-from l2dgs_jax.runs import Run, open_run
+from l2dgs_jax.runs import Run, is_needed, open_run
 from l2dgs_jax.runs.views import get_split
 from l2dgs_jax.runtime import command_line
 from l2dgs_jax.runtime.files import make_folder, new_folder, replacing, write_json
@@ -115,6 +115,8 @@ def _check(options: Export) -> None:
     suffix = Path(DEFAULT_FILES[options.to]).suffix
     if options.output and not options.sequence and options.output.suffix != suffix:
         raise UserError(f"--output {options.output}: expected a file name that ends in {suffix}")
+    if options.output and is_needed(options.output, options.run):
+        raise UserError(f"--output {options.output}: a file of the run itself; expected another one")
 
 
 def _write_splats(run: Run, options: Export, path: Path) -> None:

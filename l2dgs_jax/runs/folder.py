@@ -122,6 +122,13 @@ def open_run(folder: str | Path, stage: Literal["final", "coarse"] = "final") ->
     return Run(config, dataset, state, folder)
 
 
+def is_needed(path: Path, folder: Path) -> bool:
+    """Whether a file is a run's settings, metrics or one of its checkpoints, which other output must not replace."""
+    kept = (file for name in (CHECKPOINT, COARSE) for file in checkpoints.kept(folder / name))
+    own = (folder / SETTINGS, folder / METRICS, *kept)
+    return path.exists() and any(file.exists() and path.samefile(file) for file in own)
+
+
 def last_checkpoint(folder: Path, dataset: Dataset, config: Config, skip: int = 0) -> Checkpoint:
     """The last undamaged checkpoint of a run folder, or the initial state if it has none.
 

@@ -1,5 +1,6 @@
 """One browser, called a guest: its window, its controls, and the picture that it shows."""
 
+import threading
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -71,6 +72,7 @@ class Guest:
         self._renderers, self._ranges, self._changed = renderers, ranges, changed
         self._shown: Shown | None = None
         self._frusta: list[Any] = []
+        self._frusta_change = threading.Lock()
         first = int(np.argmin(dataset.train.cameras.time))
         self._panel = Panel(client.gui, changed, renderers.run.config.model.decomposition == "retinex")
         self._panel.home.on_click(lambda _: self._go(first))
@@ -137,14 +139,11 @@ class Guest:
         self._moved()
 
     def _show_frusta(self) -> None:
-        if self._panel.frusta.value:
-            count = len(self._dataset.train.names)
-            chosen = evenly_spread(count, MAX_FRUSTA)
-            self._frusta = [self._frustum(int(index)) for index in chosen]
-        else:
+        with self._frusta_change:  # each click has its own thread, and frusta take a moment to make
             for frustum in self._frusta:
                 frustum.remove()
-            self._frusta = []
+            chosen = evenly_spread(len(self._dataset.train.names), MAX_FRUSTA) if self._panel.frusta.value else ()
+            self._frusta = [self._frustum(int(index)) for index in chosen]
         self._changed()
 
     def _frustum(self, index: int) -> Any:

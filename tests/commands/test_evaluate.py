@@ -264,6 +264,7 @@ def test_a_separate_process_in_single_precision_gives_the_same_scores(base, resu
             "scores.json: cannot be written; expected a file in a writable",
         ),
         (["{run}", "--json", "{empty}"], "empty: cannot be written; expected a file in a writable folder"),
+        (["{run}", "--json", "{run}/config.json"], "config.json: a file of the run itself; expected another one"),
         (
             ["{run}", "--lpips-alex", "{missing}.npz"],
             "missing.npz: cannot be read (No such file or directory); expected",

@@ -178,6 +178,16 @@ def test_invalid_input_gives_one_sentence_and_exit_2(run_folder, baked_times, tm
     assert [p.name for p in tmp_path.iterdir()] == ["note.txt"]
 
 
+@pytest.mark.parametrize(("format", "name"), [("npz", "checkpoint.npz"), ("cameras", "config.json")])
+def test_files_that_the_run_needs_are_not_replaced(run_folder, capsys, format, name):
+    file = run_folder / name
+    before = file.read_bytes()
+    with pytest.raises(SystemExit):
+        run_command(run_folder, "--to", format, "--output", file)
+    assert f"--output {file}: a file of the run itself; expected another one" in capsys.readouterr().err
+    assert file.read_bytes() == before
+
+
 @pytest.mark.slow
 def test_a_separate_process_bakes_and_exports(run_folder, tmp_path):
     """In that process, floats have single precision."""

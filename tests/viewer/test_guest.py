@@ -1,5 +1,6 @@
 """One browser: when it asks for a picture, and which picture it gets."""
 
+from threading import Event, Thread
 from types import SimpleNamespace
 from typing import get_args
 
@@ -210,6 +211,26 @@ def test_filmed_frames_can_be_shown_hidden_and_flown_to(dataset, visit, renderer
     assert not visit.client.frusta
     visit.next_picture()
     assert visit.client.depth is None
+
+
+def test_filmed_frames_that_are_hidden_while_they_are_being_shown_do_not_stay(visit, monkeypatch):
+    box, add, begun, go_on = visit.gui["Filmed frames"], visit.client.scene.add_camera_frustum, Event(), Event()
+
+    def slow(*arguments, **facts):
+        begun.set()
+        go_on.wait(10)
+        return add(*arguments, **facts)
+
+    monkeypatch.setattr(visit.client.scene, "add_camera_frustum", slow)
+    clicks = [Thread(target=box.move, args=(shown,)) for shown in (True, False)]
+    clicks[0].start()
+    begun.wait(10)
+    clicks[1].start()
+    clicks[1].join(0.1)  # it may have to wait for the first one
+    go_on.set()
+    for click in clicks:
+        click.join()
+    assert not visit.client.frusta
 
 
 def test_what_acts_on_the_decomposition_is_disabled_without_one(dataset, renderers):
