@@ -5,6 +5,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import OpenImageIO as oiio  # noqa: N813
 
 GAIN = 4.0  # well-lit over low-light value
 
@@ -108,3 +109,10 @@ def edit_json(path: Path, **changes: object) -> None:
     """Replace top-level keys of a JSON file; None removes one."""
     content = {**json.loads(path.read_text()), **changes}
     write_json(path, {key: value for key, value in content.items() if value is not None})
+
+
+def mark_orientation(path: Path, orientation: int) -> None:
+    """Give a picture EXIF's orientation, and leave its pixels."""
+    pixels = oiio.ImageBuf(str(path))
+    pixels.specmod().attribute("Orientation", orientation)
+    assert pixels.write(str(path))

@@ -17,9 +17,8 @@ from l2dgs_jax.data import colmap_model, splits
 from l2dgs_jax.data.assembly import Frame, assemble
 from l2dgs_jax.data.colmap_model import ModelCamera, ModelImage
 from l2dgs_jax.data.dataset import Dataset
-from l2dgs_jax.data.images import read_header
 from l2dgs_jax.data.lens import Lens
-from l2dgs_jax.data.pictures import Picture, by_name, copies
+from l2dgs_jax.data.pictures import by_name, copies, is_turned
 from l2dgs_jax.data.writing import write_lists, write_pictures
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.runtime.files import new_folder
@@ -68,7 +67,7 @@ def read(folder: Path, downscale: int, held_out: str, frame_memory: float) -> Da
             if not (K[0, 0] > 0 and K[1, 1] > 0):
                 raise UserError(f"{model}: camera {image.camera} has no positive focal length; expected one")
             source, size = f"{model}, camera {image.camera}", (camera.width, camera.height)
-            upright = _is_turned(picture, size)
+            upright = is_turned(picture, size)
             described.append(Frame(name, source, image.viewmat, K, lens, size, times[name], picture, upright=upright))
         return described
 
@@ -136,10 +135,3 @@ def _root(folder: Path, names: list[str]) -> Path:
             "expected those that it was made from in images/"
         )
     return originals[0]
-
-
-def _is_turned(picture: Picture, size: tuple[int, int]) -> bool:
-    """Whether only once turned as EXIF says a picture fits its camera; COLMAP itself ignores EXIF's orientation."""
-    header = read_header(picture.path)
-    fits = lambda found: all(abs(a - b / picture.scale) < 1 for a, b in zip(found, size, strict=True))
-    return header.orientation >= 5 and fits(header.size) and not fits(header.size[::-1])

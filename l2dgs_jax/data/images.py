@@ -163,7 +163,8 @@ def _is_whole_jpeg(content: bytes) -> bool:
     """Whether the end of a JPEG picture follows its first scan; a thumbnail in its header has an end of its own."""
     at, scan, end = 2, 0xDA, b"\xff\xd9"
     while content[at : at + 1] == b"\xff" and at + 4 <= len(content) and content[at + 1] != scan:
-        at += 2 + int.from_bytes(content[at + 2 : at + 4], "big")
+        fill = content[at + 1] == 0xFF  # of which any number may precede a marker
+        at += 1 if fill else 2 + int.from_bytes(content[at + 2 : at + 4], "big")
     return end in content[at:]
 
 

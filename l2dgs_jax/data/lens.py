@@ -74,7 +74,9 @@ def undistort(
 
 
 def seen(size: tuple[int, int], K: Float[np.ndarray, "3 3"], lens: Lens) -> Bool[np.ndarray, "H W"] | None:
-    """Where the result of `undistort` lies inside the original picture; None if everywhere.
+    """Where the result of `undistort` lies inside the original picture, and not mirrored; None if everywhere.
+
+    Beyond some radius, the polynomial of a barrel distortion comes back to the middle, where no lens does.
 
     Args:
         size: width and height in pixels.
@@ -132,7 +134,18 @@ def _seen(width: int, height: int, K: tuple[float, ...], lens: Lens) -> Bool[np.
     columns, rows = _distorted_positions(width, height, K, lens)
     # Up to the edges of the outermost pixels; false for NaN.
     inside = (columns >= -0.5) & (columns <= width - 0.5) & (rows >= -0.5) & (rows <= height - 0.5)
+    radius = np.hypot(*_directions(width, height, K))
+    inside &= radius < _fold(lens, float(radius.max()))
     return None if inside.all() else inside
+
+
+def _fold(lens: Lens, reach: float) -> float:
+    """The radius, up to `reach`, from which on the lens images directions nearer to the middle again, or infinity."""
+    radii = np.linspace(0, reach, 4096)
+    with np.errstate(all="ignore"):
+        imaged, _ = distort(lens._replace(tangential=(0.0, 0.0)), radii, 0 * radii)
+        folds = np.flatnonzero(~(np.diff(imaged) > 0))
+    return float(radii[folds[0]]) if len(folds) else np.inf
 
 
 def _distorted_positions(
@@ -140,11 +153,19 @@ def _distorted_positions(
 ) -> tuple[Float32[np.ndarray, "H W"], Float32[np.ndarray, "H W"]]:
     """For each pixel of the undistorted picture, its column and row in the distorted one; pixel 0 is centred at 0."""
     fx, skew, cx, _, fy, cy = K
-    x = ((np.arange(width) + 0.5 - cx)[None, :] / fx).astype(np.float32)  # exact to 1/1000 pixel; twice as fast
-    y = ((np.arange(height) + 0.5 - cy)[:, None] / fy).astype(np.float32)
+    x, y = _directions(width, height, K)
     with np.errstate(all="ignore"):  # a nonsensical lens gives positions outside the picture
         lens_x, lens_y = distort(lens, *np.broadcast_arrays(x, y))
         return fx * lens_x + skew * lens_y + cx - 0.5, fy * lens_y + cy - 0.5
+
+
+def _directions(
+    width: int, height: int, K: tuple[float, ...]
+) -> tuple[Float32[np.ndarray, "1 W"], Float32[np.ndarray, "H 1"]]:
+    """Normalised image coordinates of the undistorted picture's pixels."""
+    fx, _, cx, _, fy, cy = K
+    x = ((np.arange(width) + 0.5 - cx)[None, :] / fx).astype(np.float32)  # exact to 1/1000 pixel; twice as fast
+    return x, ((np.arange(height) + 0.5 - cy)[:, None] / fy).astype(np.float32)
 
 
 @functools.lru_cache(maxsize=4)

@@ -18,7 +18,7 @@ from l2dgs_jax.data.assembly import Frame, assemble
 from l2dgs_jax.data.dataset import Dataset
 from l2dgs_jax.data.lens import Lens
 from l2dgs_jax.data.parsing import read_array, rotation
-from l2dgs_jax.data.pictures import by_name, copies
+from l2dgs_jax.data.pictures import Picture, by_name, copies, is_turned
 from l2dgs_jax.data.writing import write_lists, write_pictures
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.runtime.files import new_folder
@@ -58,12 +58,12 @@ def read(folder: Path, downscale: int, held_out: str, frame_memory: float) -> Da
     described = {name: _camera(f"{path}, row {i}", row) for i, (name, row) in enumerate(zip(names, rows, strict=True))}
 
     def frames(chosen: list[str]) -> list[Frame]:
-        return [
-            Frame(name, f"{path}, row {names.index(name)}", *described[name], times[name], picture)
-            for name, picture in zip(
-                chosen, copies(folder, root, downscale, {name: name for name in chosen}, in_order=True), strict=True
-            )
-        ]
+        pictures = copies(folder, root, downscale, {name: name for name in chosen}, in_order=True)
+        return [frame(name, picture) for name, picture in zip(chosen, pictures, strict=True)]
+
+    def frame(name: str, picture: Picture) -> Frame:
+        source, upright = f"{path}, row {names.index(name)}", is_turned(picture, described[name][-1])
+        return Frame(name, source, *described[name], times[name], picture, upright=upright)
 
     model, cloud = colmap_model.find(folder), clouds.find(folder)
     if cloud is None and model:

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from l2dgs_jax.data.images import SUFFIXES
+from l2dgs_jax.data.images import SUFFIXES, read_header
 from l2dgs_jax.errors import UserError
 
 _SCALE = re.compile(r"([1-9]\d{0,3})x")
@@ -124,6 +124,23 @@ def only(files: Sequence[Path], meant: Path | None = None) -> Path:
     if len(files) > 1:
         raise UserError(f"{files[0]}: differs from {files[1].name} only in its suffix; expected one file per frame")
     return files[0]
+
+
+def is_turned(picture: Picture, size: tuple[int, int]) -> bool:
+    """Whether only once turned as EXIF says a picture fits its camera.
+
+    Programs that find cameras, such as COLMAP, ignore EXIF's orientation.
+
+    Args:
+        picture: file of a frame.
+        size: width and height of its camera in full size.
+
+    Raises:
+        UserError: the file cannot be read.
+    """
+    header = read_header(picture.path)
+    fits = lambda found: all(abs(a - b / picture.scale) < 1 for a, b in zip(found, size, strict=True))
+    return header.orientation >= 5 and fits(header.size) and not fits(header.size[::-1])
 
 
 def _coarsest(root: Path, downscale: int) -> tuple[Path, int]:

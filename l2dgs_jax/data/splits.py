@@ -14,6 +14,7 @@ Lists = tuple[list[str], list[str]]  # names to train on, names held out
 NO_LISTS: Lists = ([], [])
 
 _DIGITS = re.compile(r"[0-9]+")
+_DECIMAL = re.compile(r"([0-9]+)\.([0-9]+)")
 _CAMERA = re.compile(r"(?<![a-z])(camera|cam|view|c|v)[-_ ]?[0-9]+", re.IGNORECASE)  # "cam01", not "frame01"
 
 
@@ -155,14 +156,31 @@ def _from_names(names: Sequence[str]) -> Float[np.ndarray, " F"]:
 
 
 def numbers_in(names: Sequence[str]) -> list[int]:
-    """The number in each name by which most names differ, counted from the end; empty if a name has none.
+    """The number in each name by which most names differ; empty if a name has none.
 
+    Decimal fractions, such as of seconds, are of one number with what they follow, and all numbers are then given in
+    units of their last digit. If names differ as much by several numbers, it is the last of these, or if they disagree
+    on the order of the names, the one with the smallest range: frames are counted, other digits are those of a hash.
     Numbers of cameras, such as in "cam01_0005", do not count if others differ.
     """
 
     def most_different(names: Sequence[str]) -> list[int]:
-        found = [[int(digits[-15:]) for digits in reversed(_DIGITS.findall(name))] for name in names]
-        return max(map(list, zip(*found, strict=False)), key=lambda numbers: len(set(numbers)), default=[])
+        found = [[int(digits[-15:]) for digits in _DIGITS.findall(name)] for name in names]
+        columns = [list(column) for rows in ([row[::-1] for row in found], found) for column in zip(*rows)]  # noqa: B905
+        most = max((len(set(column)) for column in columns), default=0)
+        tied = [column for column in columns if len(set(column)) == most]
+        orders = {tuple(np.argsort(column, kind="stable")) for column in tied}
+        return min(tied, key=np.ptp) if len(orders) > 1 else [*tied, []][0]
 
+    names = _without_points(names)
     without_cameras = most_different([_CAMERA.sub("", name) for name in names])
     return without_cameras if len(set(without_cameras)) > 1 else most_different(names)
+
+
+def _without_points(names: Sequence[str]) -> Sequence[str]:
+    """The names with decimals as whole numbers, unless points only separate numbers, as in "1.9" and "1.10"."""
+    decimals = [decimal for name in names for decimal in _DECIMAL.findall(name)]
+    wholes, widths = {whole for whole, _ in decimals}, {len(fraction) for _, fraction in decimals}
+    if len(widths) > 1 and len(wholes) == 1:
+        return names
+    return [_DECIMAL.sub(lambda found: found[1] + found[2].ljust(max(widths), "0"), name) for name in names]

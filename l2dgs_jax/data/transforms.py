@@ -23,7 +23,7 @@ from l2dgs_jax.data.dataset import Dataset
 from l2dgs_jax.data.images import SUFFIXES, read_header
 from l2dgs_jax.data.lens import Lens
 from l2dgs_jax.data.parsing import name_list, numbers, read_json, rotation, value
-from l2dgs_jax.data.pictures import Picture, copies
+from l2dgs_jax.data.pictures import Picture, copies, is_turned
 from l2dgs_jax.data.splits import NO_LISTS, Lists
 from l2dgs_jax.data.writing import write_pictures
 from l2dgs_jax.errors import UserError
@@ -220,7 +220,8 @@ def _frame(name: str, path: Path, content: dict[str, Any], file: Path, time: flo
         raise UserError(f"{source}: 'w' and 'h' are {size}; expected positive numbers of pixels")
     K, lens = _intrinsics(path, source, content, size)
     mask = Picture(_picture(path, value(source, content, "mask_path", str)), 1) if content.get("mask_path") else None
-    return Frame(name, source, viewmat, K, lens, size, time, picture, alpha="coverage", mask=mask)
+    upright = is_turned(picture, size)
+    return Frame(name, source, viewmat, K, lens, size, time, picture, alpha="coverage", mask=mask, upright=upright)
 
 
 def _intrinsics(

@@ -33,4 +33,9 @@ def misfit(dataset: Dataset, config: Config) -> str | None:
     grows = config.density.start < config.density.stop
     if len(dataset.points) < FEW_POINTS and not (grows or config.model.surfaces):
         return f"{len(dataset.points)} points are few and none are added; expect blur, or add some (--density.stop)"
+    if len(dataset.points) > int(config.density.max_gaussians):
+        return (
+            f"of {len(dataset.points)} points only {config.density.max_gaussians} are used, as many as there may be "
+            "Gaussians; --density.max-gaussians allows more, which take more time and memory"
+        )
     return None

@@ -10,6 +10,7 @@ from l2dgs_jax.cameras.flow import check_size
 from l2dgs_jax.cameras.geometry import median_depth
 from l2dgs_jax.config import Config, overrides
 from l2dgs_jax.data.dataset import Dataset, Split
+from l2dgs_jax.data.stacks import evenly_spread
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.model import networks
 from l2dgs_jax.model.initialisation import initialise, path_knots, scene_shapes, z_order
@@ -103,15 +104,23 @@ def _max_gaussians(split: Split) -> int:
 
 
 def initial_state(dataset: Dataset, config: Config) -> TrainState:
-    """The state before the first step of a `resolve`d config; the same seed and data give the same state."""
-    train, points = dataset.train, dataset.points
+    """The state before the first step of a `resolve`d config; the same seed and data give the same state.
+
+    Of more points than there may be Gaussians, as many are used, as densely where they are dense.
+    """
+    train, most = dataset.train, int(config.density.max_gaussians)
     colors = dataset.colors if config.model.initial_illumination is None else None  # what they are needed for
+    cloud = dataset.points
+    if len(cloud) > most:
+        kept = z_order(cloud)[evenly_spread(len(cloud), most)]
+        cloud, colors = cloud[kept], None if colors is None else colors[kept]
+    points = cloud
     gains, even = None, train
     if config.model.exposure == "drifting":
         gains = exposures(points, train.cameras, train.images, train.valid)
         even = dataclasses.replace(train, images=evenly_exposed(train.images, gains))
     if config.model.surfaces:
-        found = find_surfaces(points, even, most=max(int(config.density.max_gaussians) - len(points), 0))
+        found = find_surfaces(points, even, most=most - len(points))
         if colors is not None:
             colors = np.concatenate([colors, observed_colors(found, train.cameras, train.images, train.valid)])
         points = np.concatenate([points, found])
@@ -120,11 +129,10 @@ def initial_state(dataset: Dataset, config: Config) -> TrainState:
     seeds = None
     if config.model.tracks:
         # Not the added points: the nearest ones of so many are too near to give the depth of what moves.
-        most = min(_max_gaussians(train), int(config.density.max_gaussians))
-        seeds = find_seeds(dataset.points, even, path_knots(config.model, len(train.names)), most)
+        seeds = find_seeds(cloud, even, path_knots(config.model, len(train.names)), min(_max_gaussians(train), most))
     capacity = len(points) + (0 if seeds is None else len(seeds.points))
     if config.density.start < config.density.stop:
-        limit = max(int(config.density.max_gaussians), capacity)
+        limit = max(most, capacity)
         capacity = limit if config.density.method == "mcmc" else next_capacity(min(1.5 * capacity, limit))
     reflectance = None
     if config.model.reflectance_init == "observed":

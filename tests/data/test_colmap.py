@@ -6,7 +6,7 @@ import struct
 import numpy as np
 import OpenImageIO as oiio  # noqa: N813
 import pytest
-from scenes import write_image, write_nerfies
+from scenes import mark_orientation, write_image, write_nerfies
 from scipy.spatial.transform import Rotation
 
 from l2dgs_jax import data
@@ -162,9 +162,7 @@ def test_pictures_are_as_stored_because_colmap_ignores_their_orientation(scene, 
     expected = data.load_dataset(scene).train.images
     shutil.copytree(scene / "images", scene / "well" / "1x")
     for path in (*(scene / "images").iterdir(), *(scene / "well" / "1x").iterdir()):
-        pixels = oiio.ImageBuf(str(path))
-        pixels.specmod().attribute("Orientation", orientation)
-        assert pixels.write(str(path))
+        mark_orientation(path, orientation)
     assert images.read_header(path).orientation == orientation
     dataset = data.load_dataset(scene)
     assert np.array_equal(dataset.train.images, expected)

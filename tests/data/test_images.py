@@ -66,8 +66,8 @@ def test_a_jpeg_without_its_end_is_refused_but_not_one_with_more_behind_it(tmp_p
     pixels = np.random.default_rng(0).integers(0, 256, (40, 60, 3), np.uint8)
     whole = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_PROGRESSIVE, progressive])[1].tobytes()
     thumbnail = b"\xff\xe1" + (len(whole) + 2).to_bytes(2, "big") + whole  # a segment that holds a whole picture
-    whole = whole[:2] + thumbnail + whole[2:]
     path = tmp_path / "a.jpg"
+    whole = whole[:2] + b"\xff\xff" + thumbnail + whole[2:]  # after bytes that fill, as a file may have them
     path.write_bytes(whole + b"\xff\xda and a film, as some phones append it")
     np.testing.assert_allclose(images.read_image(path).mean(), 0.5, atol=0.03)
     for part in (0.99, 0.8):
@@ -147,6 +147,21 @@ def test_undistortion_moves_a_ramp_to_where_the_lens_says():
     shown = lens.undistort(ramp, K, radial)[..., 0]
     inside = (columns > 3) & (columns < 57)
     np.testing.assert_allclose(shown[inside], (0.1 + 0.8 * (columns - 0.5) / 59)[inside], atol=1e-5)
+
+
+@pytest.mark.parametrize(("fisheye", "focal"), [(False, 45), (True, 15)])
+def test_what_a_barrel_distortion_would_mirror_is_not_seen(fisheye, focal):
+    K = np.array([[focal, 0, 50], [0, focal, 30], [0, 0, 1.0]])
+    barrel = lens.Lens((-0.25,), fisheye=fisheye)
+    x, y = np.meshgrid((np.arange(100) + 0.5 - 50) / focal, (np.arange(60) + 0.5 - 30) / focal)
+    r = np.hypot(x, y)
+    imaged = lambda r: lens.distort(barrel, r, 0 * r)[0]
+    grows = imaged(r + 1e-4) > imaged(r)
+    clear = abs(imaged(r + 1e-4) - imaged(r)) > 1e-6
+    seen = lens.seen((100, 60), K, barrel)
+    assert grows[clear].any()
+    assert not grows[clear].all()
+    np.testing.assert_array_equal(seen[clear], grows[clear])
 
 
 def test_an_absurd_lens_gives_finite_values():

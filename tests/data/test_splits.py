@@ -49,6 +49,12 @@ def test_unknown_rules_are_refused(rule):
         (["take7", "take7b", "take7c"], [0, 0.5, 1]),  # all have the same number: by order
         (["1", "2", "x"], [0, 0.5, 1]),  # not all have a number: by order
         (["only"], [0]),
+        (["1305.98", "1306.02", "1306.06"], [0, 0.5, 1]),  # seconds with fractions
+        (["t1.5", "t1.75", "t2.0"], [0, 0.5, 1]),
+        (["s1.9", "s1.10", "s1.11"], [0, 0.5, 1]),  # the tenth of part 1
+        (["0_a81f", "1_b20d", "3_e9"], [0, 1 / 3, 1]),  # hashes behind
+        (["a81f_0", "b20d_1", "e9_3"], [0, 1 / 3, 1]),
+        (["0_7300", "1_7340", "2_7400"], [0, 0.4, 1]),  # numbers and times
     ],
 )
 def test_instants_from_names(tmp_path, names, expected):

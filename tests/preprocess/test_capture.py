@@ -87,6 +87,12 @@ def test_frames_of_a_video_keep_their_pixels_and_instants(tmp_path):
         np.testing.assert_array_equal(images.to_bytes(images.read_image(tmp_path / found[i].name)), pictures[i])
 
 
+def test_times_increase_though_one_is_repeated_and_frames_are_numbered_without_times():
+    assert frames._increasing([0, 33, 66, 400, 400, 800]) == [0, 33, 66, 400, 401, 800]
+    assert frames._increasing([0, 0, 0, 0]) == [0, 1, 2, 3]
+    assert frames._increasing([7]) == [7]
+
+
 def test_a_rotated_video_is_turned_upright(tmp_path):
     path = tmp_path / "phone.mp4"
     clips.write_video(path, [images.to_bytes(random_image(i, (32, 64, 3))) for i in range(3)], "mp4v")

@@ -28,6 +28,7 @@ def test_a_scene_that_suits_its_settings_gives_no_warning():
         (dataset_of(size=(1920, 1080)), GROWING, ["1920x1080", "23 times", "--downscale 3"]),
         (dataset_of(frames=5), GROWING, ["5 frames"]),
         (dataset_of(points=20), FIXED, ["20 points", "--density.stop"]),
+        (dataset_of(), dataclasses.replace(GROWING, max_gaussians=300), ["of 500 points only 300", "--density.max"]),
     ],
 )
 def test_a_misfit_gives_a_warning_of_one_line(dataset, density, words):

@@ -90,6 +90,18 @@ def test_the_target_of_the_exponent_prior_is_its_initial_value(dataset, monkeypa
     assert spied_objective(dataset, monkeypatch, config, False)(0)["exponent_target"] == target
 
 
+def test_of_more_points_than_there_may_be_gaussians_as_many_are_used(dataset):
+    rng = np.random.default_rng(0)
+    dense = dataclasses.replace(dataset, points=rng.normal(size=(900, 3)), colors=rng.random((900, 3), np.float32))
+    state = initial_state(dense, config_of(**{"density.max_gaussians": 70}))
+    used = np.asarray(state.scene.params.gaussians.means)[np.asarray(state.scene.alive)]
+    assert len(used) == 70
+    apart = np.linalg.norm(used[:, None] - dense.points, axis=-1)
+    assert len(set(apart.argmin(1))) == 70
+    np.testing.assert_allclose(apart.min(1), 0, atol=1e-6)
+    assert (abs(used.mean(0)) < 0.3).all()
+
+
 def test_the_planes_are_smoothed_in_the_fine_stage_only(dataset):
     weights = {"loss.plane_smoothness": 2.0, "loss.time_smoothness": 3.0, "loss.time_l1": 5.0}
     config, batch = config_of(**weights), batch_of(dataset.train, [0, 3])

@@ -53,9 +53,7 @@ def scan(source: Path) -> list[Candidate]:
             times.append(round(milliseconds))
             scores.append(sharpness(frame[..., ::-1].astype(np.float32) / 255))
             bar.update()
-    # If the container has no time stamps, so that times do not increase, frames are numbered instead.
-    numbers = times if np.all(np.diff(times) > 0) else range(len(times))
-    return [Candidate(n, f"frame {i}", score) for i, (n, score) in enumerate(zip(numbers, scores, strict=True))]
+    return [Candidate(n, f"frame {i}", s) for i, (n, s) in enumerate(zip(_increasing(times), scores, strict=True))]
 
 
 def sample(scores: Sequence[float], count: int) -> list[int]:
@@ -79,7 +77,8 @@ def sample(scores: Sequence[float], count: int) -> list[int]:
 def extract(source: Path, candidates: Sequence[Candidate], chosen: Sequence[int], folder: Path) -> None:
     """Write the chosen frames to `folder`, which may already hold some of them from an earlier call.
 
-    PNG files are copied byte by byte; video frames and other pictures become upright PNG with the same pixel values.
+    PNG files are copied byte by byte; other pictures become upright PNG with the same pixel values, and so do video
+    frames as they are decoded, with 8 bits.
 
     Raises:
         UserError: a frame cannot be read or written.
@@ -120,6 +119,14 @@ def shrink(grey: Shaped[np.ndarray, "H W"], longest: int) -> Shaped[np.ndarray, 
     """Reduce a picture whose longer side exceeds `longest`."""
     scale = longest / max(grey.shape)
     return grey if scale >= 1 else cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+
+
+def _increasing(times: Sequence[int]) -> list[int]:
+    """The times, one later where a time stamp is repeated; or numbers if the container has no time stamps."""
+    order = np.arange(len(times))
+    if np.sum(np.diff(times) > 0) < len(times) // 2:
+        return order.tolist()
+    return (np.maximum.accumulate(times - order) + order).tolist()
 
 
 def _scan_folder(folder: Path) -> list[Candidate]:
