@@ -110,11 +110,10 @@ def initial_state(dataset: Dataset, config: Config) -> TrainState:
     """
     train, most = dataset.train, int(config.density.max_gaussians)
     colors = dataset.colors if config.model.initial_illumination is None else None  # what they are needed for
-    cloud = dataset.points
-    if len(cloud) > most:
-        kept = z_order(cloud)[evenly_spread(len(cloud), most)]
-        cloud, colors = cloud[kept], None if colors is None else colors[kept]
-    points = cloud
+    points = dataset.points
+    if len(points) > most:
+        kept = z_order(points)[evenly_spread(len(points), most)]
+        points, colors = points[kept], None if colors is None else colors[kept]
     gains, even = None, train
     if config.model.exposure == "drifting":
         gains = exposures(points, train.cameras, train.images, train.valid)
@@ -129,7 +128,8 @@ def initial_state(dataset: Dataset, config: Config) -> TrainState:
     seeds = None
     if config.model.tracks:
         # Not the added points: the nearest ones of so many are too near to give the depth of what moves.
-        seeds = find_seeds(cloud, even, path_knots(config.model, len(train.names)), min(_max_gaussians(train), most))
+        knots = path_knots(config.model, len(train.names))
+        seeds = find_seeds(dataset.points, even, knots, min(_max_gaussians(train), most))
     capacity = len(points) + (0 if seeds is None else len(seeds.points))
     if config.density.start < config.density.stop:
         limit = max(most, capacity)
