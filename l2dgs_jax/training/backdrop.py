@@ -14,7 +14,7 @@ from l2dgs_jax.types import Camera
 DEPTH_CELL = 4  # side in pixels of a square that has one depth
 NEIGHBOURS = 30  # nearest points of a pixel that depths are taken from
 STATIC_QUANTILES = 0.03, 0.97  # of their depths, between which static surfaces may lie: a few points are outliers
-CANDIDATES = 16  # depths in that range, evenly spaced in inverse depth; with fewer, what is between them seems to move
+CANDIDATES = 4  # depths in that range, evenly spaced in inverse depth
 BORDER = 0.1  # distance from the picture within which points still count, in focal lengths
 ON_GROUND = 0.8  # a surface is taken for the ground from this share of the ground's depth there up to its inverse
 
