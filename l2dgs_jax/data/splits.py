@@ -119,8 +119,9 @@ def lists_beside(folder: Path, names: Sequence[str]) -> Lists:
 def instants(folder: Path, names: Sequence[str]) -> dict[str, float]:
     """The frames' instants in [0, 1].
 
-    They come from `metadata.json`: "time", or else "warp_id" or "time_id". Without it, they are the numbers in the
-    names (see `numbers_in`), if these differ; or else the order of the names. All are `normalised`.
+    They come from `metadata.json`: "time", `normalised`, or else "warp_id" or "time_id", scaled to [0, 1]. Without it,
+    they are the numbers in the names (see `numbers_in`), scaled likewise, if these differ; or else the order of the
+    names.
 
     Raises:
         UserError: `metadata.json` is malformed, or has entries for some of the frames only.
@@ -130,15 +131,23 @@ def instants(folder: Path, names: Sequence[str]) -> dict[str, float]:
     known = metadata.keys() & set(names)
     entries = [value(path, metadata, name, dict) for name in names] if known else []
     key = next((key for key in ("time", "warp_id", "time_id") if any(key in entry for entry in entries)), None)
-    moments = np.array([float(numbers(path, entry, key, ())) for entry in entries]) if key else _from_names(names)
-    return dict(zip(names, normalised(moments).tolist(), strict=True))
+    if key:
+        moments = np.array([float(numbers(path, entry, key, ())) for entry in entries])
+        moments = normalised(moments) if key == "time" else _spread(moments)
+    else:
+        moments = _spread(_from_names(names))
+    return dict(zip(names, moments.tolist(), strict=True))
 
 
 def normalised(times: Float[np.ndarray, " F"]) -> Float[np.ndarray, " F"]:
-    """Times scaled to [0, 1], from the first to the last; all 0 if there is only one."""
-    if np.abs(times).max() > 1e300:
-        times = times / 4  # so that no difference overflows
-    return (times - times.min()) / (np.ptp(times) or 1.0)
+    """Times unchanged if they all lie in [0, 1], or else scaled to that range."""
+    return times if times.min() >= 0 and times.max() <= 1 else _spread(times)
+
+
+def _spread(values: Float[np.ndarray, " F"]) -> Float[np.ndarray, " F"]:
+    if np.abs(values).max() > 1e300:
+        values = values / 4  # so that no difference overflows
+    return (values - values.min()) / (np.ptp(values) or 1.0)
 
 
 def _from_names(names: Sequence[str]) -> Float[np.ndarray, " F"]:
