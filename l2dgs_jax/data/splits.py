@@ -166,9 +166,8 @@ def numbers_in(names: Sequence[str]) -> list[int]:
 
     def most_different(names: Sequence[str]) -> list[int]:
         found = [[int(digits[-15:]) for digits in _DIGITS.findall(name)] for name in names]
-        columns = [
-            list(column) for rows in ([row[::-1] for row in found], found) for column in zip(*rows, strict=False)
-        ]
+        either_end = [row[::-1] for row in found], found
+        columns = [list(column) for rows in either_end for column in zip(*rows, strict=False)]
         most = max((len(set(column)) for column in columns), default=0)
         tied = [column for column in columns if len(set(column)) == most]
         orders = {tuple(np.argsort(column, kind="stable")) for column in tied}
