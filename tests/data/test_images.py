@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import OpenImageIO as oiio  # noqa: N813
 import pytest
-from scenes import write_image, write_nerfies
+from scenes import mark_orientation, write_image, write_nerfies
 
 from l2dgs_jax import data
 from l2dgs_jax.data import assembly, images, lens
@@ -95,6 +95,16 @@ def test_photos_are_turned_upright(tmp_path, orientation):
     assert images.read_header(tmp_path / "a.tif") == ((6, 4), orientation, False)
     viewer = oiio.ImageBuf(str(tmp_path / "a.tif"))
     np.testing.assert_array_equal(oiio.ImageBufAlgo.reorient(viewer).get_pixels(oiio.UINT8), upright)
+
+
+@pytest.mark.parametrize("layout", ["transforms", "llff"])
+@pytest.mark.parametrize("orientation", [3, 6])
+def test_photos_that_fit_their_cameras_are_not_turned(tmp_path, layout, orientation):
+    data.LAYOUTS[layout].write(data.load_dataset(write_nerfies(tmp_path / "nerfies", 9)), tmp_path / "scene")
+    expected = data.load_dataset(tmp_path / "scene").train.images
+    for path in (tmp_path / "scene" / "images").iterdir():
+        mark_orientation(path, orientation)
+    assert np.array_equal(data.load_dataset(tmp_path / "scene").train.images, expected)
 
 
 def test_a_turned_photo_of_the_wrong_size_is_named_as_such(tmp_path):

@@ -4,7 +4,7 @@ import shutil
 
 import numpy as np
 import pytest
-from scenes import mark_orientation, write_image, write_nerfies
+from scenes import write_image, write_nerfies
 
 from l2dgs_jax import data
 from l2dgs_jax.data import clouds, colmap, llff
@@ -39,14 +39,6 @@ def test_axes_are_down_right_back(scene):
 
 def test_every_eighth_frame_is_held_out(scene):
     assert data.load_dataset(scene).test.names == ("000000", "000008")
-
-
-@pytest.mark.parametrize("orientation", [3, 6])
-def test_pictures_are_as_stored_although_they_have_an_orientation(scene, orientation):
-    expected = data.load_dataset(scene).train.images
-    for path in (scene / "images").iterdir():
-        mark_orientation(path, orientation)
-    assert np.array_equal(data.load_dataset(scene).train.images, expected)
 
 
 def test_random_points_lie_between_the_bounds_of_some_view(scene):

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scenes import edit_json, mark_orientation, write_image, write_json, write_nerfies
+from scenes import edit_json, write_image, write_json, write_nerfies
 
 from l2dgs_jax import data
 from l2dgs_jax.data import clouds, colmap, transforms
@@ -285,14 +285,6 @@ def test_ply_clouds_of_any_format_are_read(tmp_path, form):
     read, colors = clouds.read_ply(tmp_path / "cloud.ply")
     np.testing.assert_array_equal(read, points)
     np.testing.assert_allclose(colors, paint / 255, rtol=1e-6)
-
-
-@pytest.mark.parametrize("orientation", [3, 6])
-def test_pictures_are_as_stored_although_they_have_an_orientation(studio, orientation):
-    expected = data.load_dataset(studio).train.images
-    for path in (studio / "images").iterdir():
-        mark_orientation(path, orientation)
-    assert np.array_equal(data.load_dataset(studio).train.images, expected)
 
 
 def test_masks_that_are_named_say_which_pixels_count(studio):
