@@ -15,6 +15,8 @@ VALUES_IN_MEMORY = 2**26  # observed colour values that are held in memory at on
 MIN_VALUE = 2 / 255  # sRGB; darker values are raised to it, as ratios of them tell little
 ALTERNATIONS = 3  # between gains given the points' colours and colours given the gains
 MAX_POINTS = 5000  # that gains are estimated from
+# A point counts as hidden if the nearest of those in its cell of the frame is nearer by more than this factor.
+CELL, HIDING = 1 / 14, 1.2  # side of a cell over the frame's height
 
 
 def observed_colors(
@@ -54,7 +56,7 @@ def exposures(
     """Log gains of the frames' colour channels, of mean 0 over the frames.
 
     A frame's gain is the median, over the points, of how much brighter they are there than in the median over the
-    frames. Points that move, are occluded or specular do no harm as long as they are few.
+    frames. Points that others hide do not count; those that move or are specular do no harm as long as they are few.
 
     Args:
         points: world units.
@@ -63,7 +65,13 @@ def exposures(
         valid: which pixels count; None for all.
     """
     points = points[:: -(-len(points) // MAX_POINTS)]
-    frames = prefetch(lambda i: _observed(points, cameras, images, valid, i, blur=True), range(len(images)))
+
+    def unhidden(frame: int) -> Float[np.ndarray, "P 3"]:
+        colors = _observed(points, cameras, images, valid, frame, blur=True)
+        colors[_hidden(points, cameras, frame, images.shape[1:3])] = np.nan
+        return colors
+
+    frames = prefetch(unhidden, range(len(images)))
     seen = np.log(np.maximum(np.stack([*frames]).astype(np.float32), MIN_VALUE))
     gains = np.zeros((len(images), 1, 3), np.float32)
     for _ in range(ALTERNATIONS):
@@ -97,3 +105,17 @@ def _observed(
     if valid is not None:
         colors[np.flatnonzero(inside)[~valid[frame][row, column]]] = np.nan
     return colors
+
+
+def _hidden(
+    points: Float[np.ndarray, "P 3"], cameras: Camera, frame: int, size: tuple[int, ...]
+) -> Bool[np.ndarray, " P"]:
+    """Which points lie behind others in a frame of that height and width."""
+    viewmat, K = np.asarray(cameras.viewmat[frame]), np.asarray(cameras.K[frame])
+    inside, pixels, depth = points_inside(points, viewmat, K, size[::-1])
+    column, row = (pixels // (CELL * size[0])).astype(int).T
+    nearest = np.full((row.max(initial=0) + 1, column.max(initial=0) + 1), np.inf)
+    np.minimum.at(nearest, (row, column), depth)
+    hidden = np.zeros(len(points), bool)
+    hidden[inside] = depth > HIDING * nearest[row, column]
+    return hidden

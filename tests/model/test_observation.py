@@ -72,6 +72,21 @@ def test_exposures_are_the_gains_of_the_frames():
     np.testing.assert_allclose(found.mean(0), 0, atol=1e-6)
 
 
+def test_points_that_are_hidden_tell_nothing_of_the_exposure():
+    rng = np.random.default_rng(7)
+    x, y = (axis.ravel() for axis in np.meshgrid(np.arange(-11.75, 12, 0.5), np.arange(-2.25, 2.5, 0.5)))
+    wall, board = np.stack([x, y, np.full_like(x, 4)], -1), np.stack([x / 4, y / 4, np.full_like(x, 1)], -1)
+    board = board[(board[:, 0] > 0.3) & (board[:, 0] < 1.7)]  # dark, and before most of what later cameras see
+    spread = cameras(np.stack([np.linspace(-0.5, 1, 9), np.zeros(9), np.zeros(9)], -1))
+    images = np.empty((9, 12, 16, 3))
+    for image, centre in zip(images, -spread.viewmat[:, 0, 3], strict=True):
+        at = (np.arange(16) + 0.5 - 8) / 10 + centre
+        image[:] = np.where((at > 0.3) & (at < 1.7), 0.1, 0.4)[None, :, None]
+    gains = rng.uniform(-0.1, 0.1, (9, 1)).repeat(3, 1)
+    found = observation.exposures(np.concatenate([wall, board]), spread, images * np.exp(gains)[:, None, None])
+    np.testing.assert_allclose(found, gains - gains.mean(0), atol=0.02)
+
+
 def test_frames_without_observations_have_no_exposure_gain():
     images, valid = wall(4, np.full((4, 3), 0.1)), np.ones((4, 12, 16), bool)
     images[2] *= 1.4
