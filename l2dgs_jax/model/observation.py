@@ -15,8 +15,9 @@ VALUES_IN_MEMORY = 2**26  # observed colour values that are held in memory at on
 MIN_VALUE = 2 / 255  # sRGB; darker values are raised to it, as ratios of them tell little
 ALTERNATIONS = 3  # between gains given the points' colours and colours given the gains
 MAX_POINTS = 5000  # that gains are estimated from
-# A point counts as hidden if the nearest of those in its cell of the frame is nearer by more than this factor.
-CELL, HIDING = 1 / 14, 1.2  # side of a cell over the frame's height
+# A point counts as hidden if a share of those in its cell of the frame, more than the few that structure from motion
+# misplaces, is nearer by more than a factor.
+CELL, HIDING_SHARE, HIDING = 1 / 14, 0.25, 1.2  # side of a cell over the frame's height
 
 
 def observed_colors(
@@ -114,8 +115,9 @@ def _hidden(
     viewmat, K = np.asarray(cameras.viewmat[frame]), np.asarray(cameras.K[frame])
     inside, pixels, depth = points_inside(points, viewmat, K, size[::-1])
     column, row = (pixels // (CELL * size[0])).astype(int).T
-    nearest = np.full((row.max(initial=0) + 1, column.max(initial=0) + 1), np.inf)
-    np.minimum.at(nearest, (row, column), depth)
+    _, cell, counts = np.unique(row * size[1] + column, return_inverse=True, return_counts=True)
+    rank = np.cumsum(counts) - counts + (HIDING_SHARE * (counts - 1)).astype(int)
+    front = depth[np.lexsort((depth, cell))][rank]
     hidden = np.zeros(len(points), bool)
-    hidden[inside] = depth > HIDING * nearest[row, column]
+    hidden[inside] = depth > HIDING * front[cell]
     return hidden
