@@ -21,6 +21,7 @@ from l2dgs_jax.types import Camera, Gaussians, Scene, SceneParams, ToneCurves
 
 SH_DC = 0.28209479177387814  # value of the first SH basis function
 LUMINANCE = np.array([0.2989, 0.587, 0.114])
+MAX_ILLUMINATION = 0.999  # that a lamp starts with: beyond 1 there is no gradient
 INITIAL_GATE = 2.0  # logit of the factor on motion that every Gaussian starts with
 EXTENT_PER_DEPTH = 0.25  # extent over median depth: about the radius of a hand-held camera's path
 MIN_SCALE = 1e-7**0.5  # lower bound on initial scales, in units of length (as 3DGS)
@@ -71,6 +72,7 @@ def initialise(
     cfg: ModelConfig,
     capacity: int,
     reflectance: np.ndarray | None = None,
+    light: np.ndarray | None = None,
     exposures: np.ndarray | None = None,
     seeds: Seeds | None = None,
     curve: np.ndarray | None = None,
@@ -89,6 +91,7 @@ def initialise(
         cfg: shape and initial state.
         capacity: rows to allocate; those past P + S are dead.
         reflectance: [P + S 3] initial reflectance, for `cfg.reflectance_init` "observed".
+        light: [P + S] factors on `cfg.initial_illumination`, above 1 for what is too bright for any reflectance.
         exposures: [F 3] logarithms of the frames' gains to start from, for `cfg.exposure` "drifting".
         seeds: S of them, for `cfg.tracks`.
         curve: [R] what all frames' tone curves start from, for `cfg.decomposition` "curve".
@@ -108,6 +111,8 @@ def initialise(
     count = len(points)
     if cfg.initial_illumination is not None:
         illumination = np.full(count, cfg.initial_illumination)
+        if light is not None:
+            illumination = np.minimum(illumination * light, MAX_ILLUMINATION)
     else:
         illumination = np.full(count, 0.5) if colors is None else np.asarray(colors) @ LUMINANCE
     bias = None if cfg.initial_exponents is None else networks.exponent_bias(cfg.initial_exponents)

@@ -30,11 +30,16 @@ class Darkening(NamedTuple):
     gain: float
     of_light: bool = False
 
-    def undone(self, values: Float[np.ndarray, "*S"]) -> Float[np.ndarray, "*S"]:
-        """The well-exposed sRGB values."""
-        if not self.of_light:
-            return (values / self.gain) ** (1 / self.exponent)
-        return linear_to_srgb((srgb_to_linear(values) / self.gain) ** (1 / self.exponent))
+    def undone(self, values: Float[np.ndarray, "*B 3"]) -> tuple[Float[np.ndarray, "*B 3"], Float[np.ndarray, "*B"]]:
+        """The well-exposed sRGB values, and for what is brighter than white the light on it, relative to all else.
+
+        Of colours brighter than that, such as those of lamps, the values are those under light that makes them white:
+        gain * light * values^exponent darkens them again. The light is 1 for all others.
+        """
+        dark = srgb_to_linear(values) if self.of_light else values
+        light = np.maximum(dark.max(-1) / self.gain, 1)
+        color = (dark / (self.gain * light[..., None])) ** (1 / self.exponent)
+        return linear_to_srgb(color) if self.of_light else color, light
 
 
 def darkening(

@@ -8,7 +8,7 @@ import numpy as np
 
 from l2dgs_jax.cameras.flow import check_size
 from l2dgs_jax.cameras.geometry import median_depth
-from l2dgs_jax.config import Config, overrides
+from l2dgs_jax.config import Config, ModelConfig, overrides
 from l2dgs_jax.data.dataset import Dataset, Split
 from l2dgs_jax.data.stacks import evenly_spread
 from l2dgs_jax.errors import UserError
@@ -91,10 +91,16 @@ def resolve(config: Config, dataset: Dataset) -> Config:
     if model.initial_exponents and model.initial_exponents[0] == "auto":
         model = dataclasses.replace(model, initial_exponents=(exponent, model.initial_exponents[1]))
     if model.initial_illumination == "auto":
-        b2 = model.initial_exponents[1] if model.initial_exponents else networks.EXPONENT_CENTRE
-        b2 = 1.0 if model.unit_exponent == "b2" else b2
-        model = dataclasses.replace(model, initial_illumination=float(f"{gain ** (1 / b2):.3g}"))
+        illumination = float(f"{gain ** (1 / _light_exponent(model)):.3g}")
+        model = dataclasses.replace(model, initial_illumination=illumination)
     return dataclasses.replace(config, model=model)
+
+
+def _light_exponent(model: ModelConfig) -> float:
+    """B2 at the start."""
+    if model.unit_exponent == "b2":
+        return 1.0
+    return float(model.initial_exponents[1]) if model.initial_exponents else networks.EXPONENT_CENTRE
 
 
 def _max_gaussians(split: Split) -> int:
@@ -134,16 +140,19 @@ def initial_state(dataset: Dataset, config: Config) -> TrainState:
     if config.density.start < config.density.stop:
         limit = max(most, capacity)
         capacity = limit if config.density.method == "mcmc" else next_capacity(min(1.5 * capacity, limit))
-    reflectance = None
+    reflectance = light = None
     if config.model.reflectance_init == "observed":
         law = split_darkening(train, config)
         observed = observed_colors(points, train.cameras, train.images, train.valid)
         if seeds is not None:
             observed = np.concatenate([observed, seeds.colors])
-        reflectance = law.undone(observed)
+        reflectance, light = law.undone(observed)
+        light = light ** (1 / _light_exponent(config.model))
     key = jax.random.key(config.seed)
     curve = power_law(split_darkening(train, config)) if config.model.decomposition == "curve" else None
-    scene = initialise(key, points, colors, train.cameras, config.model, capacity, reflectance, gains, seeds, curve)
+    scene = initialise(
+        key, points, colors, train.cameras, config.model, capacity, reflectance, light, gains, seeds, curve
+    )
     return _begin_stage(scene, jnp.zeros((), jnp.int32), config, config.coarse_steps)
 
 

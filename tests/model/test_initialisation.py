@@ -54,6 +54,13 @@ def test_illumination_is_the_luminance_of_the_points():
     np.testing.assert_allclose(CFG.illumination_offset + SH_DC * set_dc, 0.8, rtol=1e-6)
 
 
+def test_lamps_start_with_more_light_but_not_beyond_the_bound():
+    light = np.linspace(1, 2, 20)
+    dc = initialise(dataclasses.replace(CFG, initial_illumination=0.8), light=light).params.gaussians.illumination_dc
+    start = CFG.illumination_offset + SH_DC * dc[:20, 0]
+    np.testing.assert_allclose(start, np.minimum(0.8 * light, initialisation.MAX_ILLUMINATION), rtol=1e-6)
+
+
 @pytest.mark.parametrize("kind", ["uniform", "normal"])
 def test_random_reflectances_have_the_chosen_distribution(kind):
     points = np.random.default_rng(2).normal(size=(3000, 3))

@@ -55,7 +55,8 @@ def test_in_linear_light_the_law_is_nearly_a_gain_and_invertible():
     assert law.exponent == pytest.approx(1.01)
     values = np.linspace(0, 1, 11)
     light = law.gain * srgb_to_linear(values) ** law.exponent
-    np.testing.assert_allclose(law.undone(linear_to_srgb(light)), values, atol=1e-6)
+    grey = linear_to_srgb(light)[:, None].repeat(3, -1)
+    np.testing.assert_allclose(law.undone(grey)[0], values[:, None].repeat(3, -1), atol=1e-6)
     dark, lit = srgb_to_linear(np.array([0.07, 0.46]))
     assert law.gain * lit**law.exponent == pytest.approx(dark)
 
@@ -120,11 +121,25 @@ def test_frames_without_highlights_are_lit_to_mid_grey(of_light):
     assert lit(frames, of_light) == pytest.approx(0.46)
 
 
+@pytest.mark.parametrize("of_light", [True, False])
+def test_what_is_brighter_than_white_has_more_light(of_light):
+    law = darkening(0.12, 0.46, of_light=of_light)
+    values = np.random.default_rng(1).uniform(size=(50, 3)) * np.linspace(0.02, 1, 50)[:, None]
+    values[-1] = 1
+    undone, light = law.undone(values)
+    assert undone.max() == pytest.approx(1)
+    color, dark = (srgb_to_linear(x) if of_light else x for x in (undone, values))
+    np.testing.assert_allclose(law.gain * light[:, None] * color**law.exponent, dark, rtol=1e-4, atol=1e-6)
+    assert (light[undone.max(-1) < 0.999] == 1).all()
+    assert (light == 1).any()
+    assert light[-1] == pytest.approx(1 / law.gain)
+
+
 def test_the_lit_level_is_lowered_for_highlights():
     frames = linear_to_srgb(0.05 * srgb_to_linear(photographs(contrast=0.6)))
     level = lit(frames)
     assert 0.34 < level < 0.45
-    undone = darkening(frames.mean(), level, of_light=True).undone(frames)
+    undone = darkening(frames.mean(), level, of_light=True).undone(frames)[0]
     assert np.quantile(undone.max(-1), 0.95) == pytest.approx(0.9, abs=0.01)
 
 
