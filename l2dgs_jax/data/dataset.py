@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Float32
 
 from l2dgs_jax.cameras.geometry import select_camera
 from l2dgs_jax.data.lens import Lens
+from l2dgs_jax.data.stacks import pixel_mean
 from l2dgs_jax.types import Camera
 
 SATURATED = 0.98  # sRGB value from which a channel counts as saturated
@@ -85,14 +86,9 @@ class Split:
     @cached_property
     def mean_level(self) -> float:
         """Mean sRGB value of all pixels that count and are not saturated, as lamps are; 1 if there are none."""
-        total, count = 0.0, 0
-        for index, image in enumerate(self.images):
-            counted = image.max(-1) < SATURATED
-            if self.valid is not None:
-                counted &= self.valid[index]
-            total += float(image.sum(dtype=np.float64, where=counted[..., None]))
-            count += int(counted.sum())
-        return total / (3 * count) if count else 1.0
+        with np.errstate(invalid="ignore"):
+            mean = pixel_mean(self.images, self.valid, below=SATURATED).mean()
+        return float(np.nan_to_num(mean, nan=1.0))
 
     def camera(self, index: int) -> Camera:
         """The camera of one frame."""

@@ -69,12 +69,17 @@ def evenly_spread(count: int, most: int) -> Int[np.ndarray, " N"]:
 
 
 def pixel_mean(
-    stack: Shaped[np.ndarray, "F H W *C"], valid: Bool[np.ndarray, "F H W"] | None = None
+    stack: Shaped[np.ndarray, "F H W *C"], valid: Bool[np.ndarray, "F H W"] | None = None, below: float | None = None
 ) -> Float[np.ndarray, "*C"]:
-    """The mean over all pixels, or all `valid` ones; only one frame at a time is in memory."""
+    """The mean over all pixels, or those that are `valid` and with all channels `below` a value; NaN if there are none.
+
+    Only one frame at a time is in memory.
+    """
     total, count = np.zeros(stack.shape[3:]), 0
     for index, frame in enumerate(stack):
         counted = np.ones(frame.shape[:2], bool) if valid is None else valid[index]
+        if below is not None:
+            counted = counted & (frame.max(-1) < below)
         total += frame.sum((0, 1), np.float64, where=counted.reshape(*counted.shape, *[1] * total.ndim))
         count += int(counted.sum())
     return np.asarray(total / count)
