@@ -2,9 +2,10 @@
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from l2dgs_jax.config import Config, LossConfig
+from l2dgs_jax.data.dataset import SATURATED
 from l2dgs_jax.model import hexplane, tone_curves
 from l2dgs_jax.model.deformation import length_unit
 from l2dgs_jax.model.rendering import render
@@ -81,7 +82,7 @@ def objective(
     lowlight, target, counted = compared(batch, images.lowlight)
     images = images._replace(lowlight=lowlight)
     measured = output._replace(images=images, depth=output.depth / length_unit(state.scene.extent, config.model))
-    loss, terms = losses.total(measured, target, cfg, eta, exponent_target(config), batch.valid)
+    loss, terms = losses.total(measured, target, cfg, eta, exponent_target(config), controlled(batch))
     others = size_terms(scene, config, moving) | curve_terms(params.curves, batch, cfg)
     if moving:
         smoothness, time_smoothness, time_l1 = hexplane.regularisers(params.hexplane)
@@ -154,6 +155,12 @@ def exposed(
     if exposures is None:
         return lowlight
     return lowlight * jnp.exp(exposures - exposures.mean(0, keepdims=True))[frames][:, None, None]
+
+
+def controlled(batch: Batch) -> Bool[Array, "V H W"]:
+    """Pixels whose brightness counts for exposure control: those that `Split.mean_level` counts too."""
+    unsaturated = batch.images.max(-1) < SATURATED
+    return unsaturated if batch.valid is None else unsaturated & batch.valid
 
 
 def compared(

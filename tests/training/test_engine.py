@@ -151,6 +151,24 @@ def test_a_step_measures_only_the_pixels_of_the_valid_mask(dataset):
     assert not np.isclose(left, right)
 
 
+def test_saturated_pixels_do_not_count_for_exposure_control(dataset):
+    config = tiny()
+    state = initial_state(dataset, config)
+    probe = jnp.zeros((2, state.scene.alive.shape[0], 2))
+    batch = batch_of(dataset.train, [1, 4])
+    half = jnp.broadcast_to(jnp.arange(WIDTH) < WIDTH // 2, (2, HEIGHT, WIDTH))
+    lamps = jnp.where(half[..., None], batch.images, jnp.array([0.5, 1, 0.5]))
+    exposure = jax.jit(
+        lambda batch: objective.objective(state.scene.params, probe, state, batch, config, False, 4096)[1][0].terms[
+            "exposure"
+        ]
+    )
+    alone = exposure(batch._replace(valid=half))
+    np.testing.assert_allclose(exposure(batch._replace(images=lamps)), alone, rtol=1e-9)
+    np.testing.assert_allclose(exposure(batch._replace(images=lamps, valid=half)), alone, rtol=1e-9)
+    assert not np.isclose(exposure(batch), alone)
+
+
 def test_training_lowers_the_loss_and_adds_gaussians(dataset):
     config = tiny(coarse_steps=40, fine_steps=0)
     member = engine.Member(dataset.train, config, initial_state(dataset, config))
