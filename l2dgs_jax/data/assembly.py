@@ -70,6 +70,7 @@ def assemble(
     downscale: int,
     frame_memory: float,
     notes: tuple[str, ...] = (),
+    points_are_random: bool = False,
 ) -> Dataset:
     """Read the pictures of the frames, undistorted and `downscale` times smaller than the cameras' full size.
 
@@ -85,6 +86,7 @@ def assemble(
         downscale: a multiple of every picture's own scale.
         frame_memory: GiB for pictures, ground truth and depth together; if they take more, they go to temporary files.
         notes: assumptions of the reader.
+        points_are_random: whether the points only stand in for a cloud that is missing.
 
     Raises:
         UserError: a picture is missing, damaged, or of another size than its camera or the other pictures; or cameras
@@ -124,6 +126,7 @@ def assemble(
         test=held_out,
         points=_single(points, f"{folder}: a point"),
         colors=colors,
+        points_are_random=points_are_random,
         notes=tuple(dict.fromkeys((*notes, *train_notes, *test_notes))),
     )
 

@@ -107,6 +107,7 @@ class Dataset:
         test: held-out frames.
         points: where the scene has surfaces, world units.
         colors: sRGB values in [0, 1] of the points, if known.
+        points_are_random: whether they only stand in for a cloud that is missing; they have no colors then.
         notes: assumptions that the reader made where the files say nothing, as sentences.
         source: where it was read from; None if it was not read from files.
     """
@@ -118,5 +119,6 @@ class Dataset:
     test: Split
     points: Float[np.ndarray, "P 3"]
     colors: Float[np.ndarray, "P 3"] | None = None
+    points_are_random: bool = False
     notes: tuple[str, ...] = ()
     source: Source | None = None

@@ -68,12 +68,12 @@ def read(folder: Path, downscale: int, held_out: str, frame_memory: float) -> Da
     model, cloud = colmap_model.find(folder), clouds.find(folder)
     if cloud is None and model:
         cloud = colmap_model.read_points(model)  # in the same world, because the poses come from this model
-    if cloud is None:
+    if random := cloud is None:
         viewmats, Ks, _, sizes = zip(*described.values(), strict=True)
         cloud = clouds.in_frusta(np.stack(viewmats), np.stack(Ks), sizes[0], rows[:, 15:]), None
         stand_in = f"{clouds.RANDOM_POINTS} random points between the bounds stand in for one"
         notes = (*notes, f"{folder} has no point cloud: {stand_in}")
-    return assemble(folder, frames(train), frames(test), *cloud, downscale, frame_memory, notes)
+    return assemble(folder, frames(train), frames(test), *cloud, downscale, frame_memory, notes, random)
 
 
 def write(dataset: Dataset, folder: Path) -> None:
@@ -98,7 +98,8 @@ def write(dataset: Dataset, folder: Path) -> None:
         write_lists(dataset, target)
         in_order = sorted(rows, key=lambda name: Path(f"{name}.png"))  # as `by_name` finds the pictures
         np.save(target / POSES_FILE, np.stack([rows[name] for name in in_order]))
-        clouds.write_ply(target / clouds.CLOUD_FILES[0], dataset.points, dataset.colors)
+        if not dataset.points_are_random:
+            clouds.write_ply(target / clouds.CLOUD_FILES[0], dataset.points, dataset.colors)
 
 
 def _camera(

@@ -61,15 +61,14 @@ def read(folder: Path, downscale: int, held_out: str, frame_memory: float) -> Da
     frames = {name: _frame(name, *entries[name], times[name], picture) for name, picture in pictures.items()}
 
     cloud = clouds.find(folder, ply)  # not from sparse/, whose world other programs have moved and scaled
-    if cloud is None:
+    if random := cloud is None:
         cloud = clouds.in_common_box(np.stack([frame.viewmat for frame in frames.values()]), str(folder)), None
         stand_in = f"{clouds.RANDOM_POINTS} random points where its cameras look stand in for one"
         notes = (*notes, f"{folder} has no point cloud: {stand_in}")
     if any("depth_file_path" in content for _, content, _ in entries.values()):
         notes = (*notes, f"{folder}: 'depth_file_path' is not read; depth belongs into depth/ (docs/data.md)")
-    return assemble(
-        folder, [frames[n] for n in train], [frames[n] for n in test], *cloud, downscale, frame_memory, notes
-    )
+    train_frames, test_frames = ([frames[name] for name in part] for part in (train, test))
+    return assemble(folder, train_frames, test_frames, *cloud, downscale, frame_memory, notes, random)
 
 
 def write(dataset: Dataset, folder: Path) -> None:
@@ -94,16 +93,18 @@ def write(dataset: Dataset, folder: Path) -> None:
         "camera_model": "OPENCV",
         "w": dataset.width,
         "h": dataset.height,
-        "ply_file_path": clouds.CLOUD_FILES[0],
         "train_filenames": files["train"],
         "val_filenames": files["val"],
         "test_filenames": files["val"],
         "frames": sorted(frames.values(), key=lambda frame: frame["file_path"]),
     }
+    if not dataset.points_are_random:
+        content["ply_file_path"] = clouds.CLOUD_FILES[0]
     with new_folder(folder) as target:
         write_pictures(dataset, target / "images", target)
         write_json(target / "transforms.json", content)
-        clouds.write_ply(target / clouds.CLOUD_FILES[0], dataset.points, dataset.colors)
+        if not dataset.points_are_random:
+            clouds.write_ply(target / clouds.CLOUD_FILES[0], dataset.points, dataset.colors)
 
 
 def world_to_camera(source: str, key: str, matrix: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "4 4"]:

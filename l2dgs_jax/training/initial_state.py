@@ -26,6 +26,8 @@ from l2dgs_jax.training.surfaces import find_surfaces
 GAUSSIANS_PER_PIXEL = (0.6, 1.5)  # of a frame: least and greatest, in between in proportion to the number of views
 VIEWS_PER_GAUSSIAN = 28  # needed for one Gaussian per pixel: with fewer views, as many Gaussians would fit noise
 MAX_GAUSSIANS = 360_000  # however large the frames
+MIN_SURFACE_POINTS = 500  # that random points give way to
+SPARSE_POINTS = 4000  # about as many as structure from motion finds, taken of those where there is no cloud
 EXPOSURE_DRIFT = 0.05  # standard deviation of the frames' log gains above which exposure counts as drifting
 
 
@@ -112,11 +114,12 @@ def _max_gaussians(split: Split) -> int:
 def initial_state(dataset: Dataset, config: Config) -> TrainState:
     """The state before the first step of a `resolve`d config; the same seed and data give the same state.
 
-    Of more points than there may be Gaussians, as many are used, as densely where they are dense.
+    Of more points than there may be Gaussians, as many are used, as densely where they are dense. Random points give
+    way to what `find_surfaces` finds, if that is enough.
     """
     train, most = dataset.train, int(config.density.max_gaussians)
     colors = dataset.colors if config.model.initial_illumination is None else None  # what they are needed for
-    points = dataset.points
+    sparse, points = dataset.points, dataset.points
     if len(points) > most:
         kept = z_order(points)[evenly_spread(len(points), most)]
         points, colors = points[kept], None if colors is None else colors[kept]
@@ -124,7 +127,11 @@ def initial_state(dataset: Dataset, config: Config) -> TrainState:
     if config.model.exposure == "drifting":
         gains = exposures(points, train.cameras, train.images, train.valid)
         even = dataclasses.replace(train, images=evenly_exposed(train.images, gains))
-    if config.model.surfaces:
+    if config.model.surfaces and dataset.points_are_random:
+        found = find_surfaces(points, even, most=most, random=True)
+        if len(found) >= MIN_SURFACE_POINTS:
+            sparse, points = found[z_order(found)[evenly_spread(len(found), SPARSE_POINTS)]], found
+    elif config.model.surfaces:
         found = find_surfaces(points, even, most=most - len(points))
         if colors is not None:
             colors = np.concatenate([colors, observed_colors(found, train.cameras, train.images, train.valid)])
@@ -133,9 +140,9 @@ def initial_state(dataset: Dataset, config: Config) -> TrainState:
     points, colors = points[order], None if colors is None else colors[order]
     seeds = None
     if config.model.tracks:
-        # Not the added points: the nearest ones of so many are too near to give the depth of what moves.
+        # Not all points: the nearest ones of so many are too near to give the depth of what moves.
         knots = path_knots(config.model, len(train.names))
-        seeds = find_seeds(dataset.points, even, knots, min(_max_gaussians(train), most))
+        seeds = find_seeds(sparse, even, knots, min(_max_gaussians(train), most))
     capacity = len(points) + (0 if seeds is None else len(seeds.points))
     if config.density.start < config.density.stop:
         limit = max(most, capacity)

@@ -60,15 +60,20 @@ class DepthMap(NamedTuple):
     inverse: Float32[np.ndarray, "H W"]
 
 
-def find_surfaces(points: Float[np.ndarray, "P 3"], split: Split, most: int) -> Float32[np.ndarray, "N 3"]:
+def find_surfaces(
+    points: Float[np.ndarray, "P 3"], split: Split, most: int, *, random: bool = False
+) -> Float32[np.ndarray, "N 3"]:
     """Points on static surfaces that the frames show and `points` do not cover; none where no flow can be trusted.
 
     Args:
         points: of the scene, world units.
         split: the frames.
         most: how many may be added; those that most frames agree on come first.
+        random: whether the points are, so that they cover nothing.
     """
-    return fused(points, depth_maps(points, split), most) if most else np.zeros((0, 3), np.float32)
+    if not most:
+        return np.zeros((0, 3), np.float32)
+    return fused(points[:0] if random else points, depth_maps(points, split), most)
 
 
 def depth_maps(points: Float[np.ndarray, "P 3"], split: Split) -> list[DepthMap]:

@@ -47,6 +47,7 @@ def test_random_points_lie_between_the_bounds_of_some_view(scene):
     dataset = data.load_dataset(scene)
     assert "no point cloud" in dataset.notes[0]
     assert len(dataset.points) == clouds.RANDOM_POINTS
+    assert dataset.points_are_random
     seen = np.zeros(clouds.RANDOM_POINTS, bool)
     for split in (dataset.train, dataset.test):
         for viewmat, K in zip(split.cameras.viewmat, split.cameras.K, strict=True):

@@ -8,7 +8,7 @@ import pytest
 from scenes import edit_json, write_image, write_json, write_nerfies
 
 from l2dgs_jax import data
-from l2dgs_jax.data import clouds, colmap, transforms
+from l2dgs_jax.data import clouds, colmap, llff, transforms
 from l2dgs_jax.data.lens import Lens, undistort
 from l2dgs_jax.errors import UserError
 
@@ -82,10 +82,19 @@ def test_without_a_cloud_random_points_fill_a_box_where_the_cameras_look(blender
     dataset = data.load_dataset(blender)
     assert "no point cloud" in dataset.notes[0]
     assert dataset.points.shape == (clouds.RANDOM_POINTS, 3)
+    assert dataset.points_are_random
     half = clouds.BOX_OVER_DISTANCE * 4
     np.testing.assert_allclose(dataset.points.min(0), np.array([1, 2, 3]) - half, atol=0.01)
     np.testing.assert_allclose(dataset.points.max(0), np.array([1, 2, 3]) + half, atol=0.01)
     assert np.array_equal(dataset.points, data.load_dataset(blender).points)
+
+
+@pytest.mark.parametrize("layout", [transforms, llff])
+def test_random_points_are_not_written_as_a_cloud(blender, tmp_path, layout):
+    written = tmp_path / "written"
+    layout.write(data.load_dataset(blender), written)
+    assert not list(written.glob("*.ply"))
+    assert data.load_dataset(written).points_are_random
 
 
 def test_points_beside_the_scene_are_found(blender):
@@ -93,6 +102,7 @@ def test_points_beside_the_scene_are_found(blender):
     clouds.write_ply(blender / "points3d.ply", points, None)
     dataset = data.load_dataset(blender)
     assert np.array_equal(dataset.points, points)
+    assert not dataset.points_are_random
     assert dataset.colors is None
     assert dataset.notes == ()
 

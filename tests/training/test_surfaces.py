@@ -12,8 +12,10 @@ from tiny_training import make_dataset, tiny
 from l2dgs_jax.cameras.epipolar import EpipolarGeometry, epipolar_geometry, project
 from l2dgs_jax.cameras.flow import pixel_indices
 from l2dgs_jax.cameras.geometry import project_points
-from l2dgs_jax.data import Split
+from l2dgs_jax.config import overrides
+from l2dgs_jax.data import Dataset, Split
 from l2dgs_jax.training import initial_state, surfaces
+from l2dgs_jax.training.initial_state import SPARSE_POINTS
 from l2dgs_jax.training.surfaces import depth_maps, find_surfaces, fused, triangulated
 from l2dgs_jax.types import Camera
 
@@ -174,6 +176,27 @@ def test_training_starts_from_the_added_points_too(monkeypatch, illumination):
     assert int(after.alive.sum()) == len(dataset.points) + len(added)
     means = np.asarray(after.params.gaussians.means[after.alive])
     assert all(np.isclose(means, point, atol=1e-6).all(-1).any() for point in added)
+
+
+@pytest.mark.parametrize("enough", [True, False])
+def test_random_points_give_way_to_surfaces(monkeypatch, enough):
+    split, _ = filmed()
+    random = np.random.default_rng(0).uniform((-2, -1, -1), (2, 1, 3), (900, 3)).astype(np.float32)
+    dataset = Dataset("cloudless", WIDTH, HEIGHT, split, split, random, points_are_random=True)
+    module, behind = sys.modules[initial_state.__module__], []
+    if not enough:
+        monkeypatch.setattr(module, "find_surfaces", lambda *_, **__: found()[:400])
+    monkeypatch.setattr(module, "find_seeds", lambda points, *_: behind.append(points))
+    config = overrides.replace(tiny(), {"model.surfaces": True, "model.tracks": True, "density.max_gaussians": 6000})
+    scene = initial_state(dataset, config).scene
+    means = np.asarray(scene.params.gaussians.means[scene.alive])
+    if enough:
+        assert len(behind[0]) == SPARSE_POINTS < len(means) <= 6000
+        for points in (means, behind[0]):
+            assert np.quantile(distance_to_surfaces(points), 0.9) < 0.15
+    else:
+        assert len(means) == 900
+        assert behind[0] is random
 
 
 def test_depth_maps_are_computed_for_at_most_max_frames(monkeypatch):
