@@ -9,7 +9,9 @@ from l2dgs_jax.cameras.geometry import camera_centres, mean_up, pixel_rays
 
 DRAWS = 2000  # planes through three random points each
 COUNTED = 2000  # random points that vote for them
-TOLERANCE = 0.01  # distance of a point from its plane, over the median distance of points from their median
+# Distance of a point from its plane, over the median distance of points from their median: of points from structure
+# from motion, and of those from optical flow.
+TOLERANCE, FLOW_TOLERANCE = 0.01, 0.03
 MIN_SHARE = 0.1  # of the points that must lie on the ground
 MAX_TILT = 55.0  # degrees between the ground's normal and the cameras' mean upward direction
 
@@ -26,7 +28,9 @@ class Ground(NamedTuple):
     height: float
 
 
-def find_ground(points: Float[np.ndarray, "P 3"], viewmats: Float[np.ndarray, "F 4 4"]) -> Ground | None:
+def find_ground(
+    points: Float[np.ndarray, "P 3"], viewmats: Float[np.ndarray, "F 4 4"], tolerance: float = TOLERANCE
+) -> Ground | None:
     """The plane that most points lie on; None if few do, or cameras are held otherwise.
 
     The plane is found by RANSAC and fitted to its points by least squares. The same points give the same plane.
@@ -34,11 +38,12 @@ def find_ground(points: Float[np.ndarray, "P 3"], viewmats: Float[np.ndarray, "F
     Args:
         points: of the scene, world units.
         viewmats: of the cameras.
+        tolerance: see `TOLERANCE`.
     """
     if len(points) < 3:
         return None
     rng = np.random.default_rng(0)
-    tolerance = TOLERANCE * np.median(np.linalg.norm(points - np.median(points, axis=0), axis=-1))
+    tolerance *= np.median(np.linalg.norm(points - np.median(points, axis=0), axis=-1))
     up = mean_up(viewmats)
     first, second, third = points[rng.integers(len(points), size=(3, DRAWS))]
     normals = np.cross(second - first, third - first)

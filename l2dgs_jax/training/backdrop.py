@@ -7,7 +7,7 @@ from jaxtyping import Float, Float32, Int
 from scipy.spatial import cKDTree
 
 from l2dgs_jax.cameras.geometry import camera_centres, pixel_rays, project_points
-from l2dgs_jax.cameras.ground import Ground, find_ground, ground_depths
+from l2dgs_jax.cameras.ground import TOLERANCE, Ground, find_ground, ground_depths
 from l2dgs_jax.runtime.prefetch import prefetch
 from l2dgs_jax.types import Camera
 
@@ -58,13 +58,16 @@ class Backdrop(NamedTuple):
         return Backdrop(Cameras(*(x[frames] for x in self.cameras)), depths, self.ground)
 
 
-def find_backdrop(points: Float[np.ndarray, "P 3"], camera: Camera, height: int, width: int) -> Backdrop:
-    """The backdrop of frames of that size, of points in world units."""
+def find_backdrop(
+    points: Float[np.ndarray, "P 3"], camera: Camera, height: int, width: int, tolerance: float = TOLERANCE
+) -> Backdrop:
+    """The backdrop of frames of that size, of points in world units; `tolerance` is that of `find_ground`."""
     cameras = Cameras(*(np.asarray(x, np.float64) for x in camera))
     frames = range(len(cameras.time))
     around = prefetch(lambda i: depths_around(points, cameras.viewmat[i], cameras.K[i], height, width), frames)
     still, hidden = zip(*around, strict=True)
-    return Backdrop(cameras, Depths(np.stack(still, axis=1), np.stack(hidden)), find_ground(points, cameras.viewmat))
+    depths = Depths(np.stack(still, axis=1), np.stack(hidden))
+    return Backdrop(cameras, depths, find_ground(points, cameras.viewmat, tolerance))
 
 
 def depths_around(

@@ -8,6 +8,7 @@ import numpy as np
 
 from l2dgs_jax.cameras.flow import check_size
 from l2dgs_jax.cameras.geometry import median_depth
+from l2dgs_jax.cameras.ground import FLOW_TOLERANCE, TOLERANCE
 from l2dgs_jax.config import Config, ModelConfig, overrides
 from l2dgs_jax.data.dataset import Dataset, Split
 from l2dgs_jax.data.stacks import evenly_spread
@@ -21,7 +22,7 @@ from l2dgs_jax.runtime.capacity import next_capacity
 from l2dgs_jax.training.seeds import find_seeds
 from l2dgs_jax.training.state import TrainState
 from l2dgs_jax.training.step import begin_stage
-from l2dgs_jax.training.surfaces import find_surfaces
+from l2dgs_jax.training.surfaces import find_surfaces, thinned
 
 GAUSSIANS_PER_PIXEL = (0.6, 1.5)  # of a frame: least and greatest, in between in proportion to the number of views
 VIEWS_PER_GAUSSIAN = 28  # needed for one Gaussian per pixel: with fewer views, as many Gaussians would fit noise
@@ -119,7 +120,7 @@ def initial_state(dataset: Dataset, config: Config) -> TrainState:
     """
     train, most = dataset.train, int(config.density.max_gaussians)
     colors = dataset.colors if config.model.initial_illumination is None else None  # what they are needed for
-    sparse, points = dataset.points, dataset.points
+    sparse, points, tolerance = dataset.points, dataset.points, TOLERANCE
     if len(points) > most:
         kept = z_order(points)[evenly_spread(len(points), most)]
         points, colors = points[kept], None if colors is None else colors[kept]
@@ -130,7 +131,7 @@ def initial_state(dataset: Dataset, config: Config) -> TrainState:
     if config.model.surfaces and dataset.points_are_random:
         found = find_surfaces(points, even, most=most, random=True)
         if len(found) >= MIN_SURFACE_POINTS:
-            sparse, points = found[z_order(found)[evenly_spread(len(found), SPARSE_POINTS)]], found
+            sparse, points, tolerance = thinned(found, SPARSE_POINTS), found, FLOW_TOLERANCE
     elif config.model.surfaces:
         found = find_surfaces(points, even, most=most - len(points))
         if colors is not None:
@@ -142,7 +143,7 @@ def initial_state(dataset: Dataset, config: Config) -> TrainState:
     if config.model.tracks:
         # Not all points: the nearest ones of so many are too near to give the depth of what moves.
         knots = path_knots(config.model, len(train.names))
-        seeds = find_seeds(sparse, even, knots, min(_max_gaussians(train), most))
+        seeds = find_seeds(sparse, even, knots, min(_max_gaussians(train), most), tolerance)
     capacity = len(points) + (0 if seeds is None else len(seeds.points))
     if config.density.start < config.density.stop:
         limit = max(most, capacity)

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
 from l2dgs_jax.cameras.geometry import camera_centres, pixel_rays
-from l2dgs_jax.cameras.ground import horizontal_per_depth
+from l2dgs_jax.cameras.ground import TOLERANCE, horizontal_per_depth
 from l2dgs_jax.data.dataset import Split
 from l2dgs_jax.model.deformation import path_weights
 from l2dgs_jax.model.initialisation import Seeds, z_order
@@ -33,7 +33,9 @@ BACKGROUND_SHARE = 0.5  # share of a track's observations, from which on it is t
 STIFFNESS = 1e-3  # weight of squared second differences of a path, relative to squared distances from the track
 
 
-def find_seeds(points: Float[np.ndarray, "P 3"], split: Split, knots: int, most: int) -> Seeds:
+def find_seeds(
+    points: Float[np.ndarray, "P 3"], split: Split, knots: int, most: int, tolerance: float = TOLERANCE
+) -> Seeds:
     """Seeds on what moves between the frames; none where no flow can be trusted.
 
     If the scene has depth maps, they tell how far away the seeds are, after being fitted to the points.
@@ -43,9 +45,10 @@ def find_seeds(points: Float[np.ndarray, "P 3"], split: Split, knots: int, most:
         split: the frames.
         knots: control points of a path.
         most: how many seeds there may be; the longest tracks come first.
+        tolerance: of `find_ground`.
     """
     height, width = split.images.shape[1:3]
-    backdrop = find_backdrop(points, split.cameras, height, width)
+    backdrop = find_backdrop(points, split.cameras, height, width, tolerance)
     split, backdrop, chosen = moving_tracks(split, backdrop, most)
     cameras = backdrop.cameras
     weights = np.asarray(path_weights(jnp.asarray(cameras.time), knots))

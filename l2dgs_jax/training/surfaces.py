@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
+from scipy.spatial import cKDTree
 
 from l2dgs_jax.cameras.epipolar import (
     EpipolarGeometry,
@@ -23,6 +24,7 @@ from l2dgs_jax.cameras.flow import brightened, matcher, pixel_indices, surely_va
 from l2dgs_jax.cameras.geometry import camera_centres, pixel_rays, points_inside
 from l2dgs_jax.data.dataset import Split
 from l2dgs_jax.data.stacks import evenly_spread
+from l2dgs_jax.model.initialisation import z_order
 from l2dgs_jax.runtime.prefetch import prefetch
 from l2dgs_jax.types import Camera
 
@@ -44,6 +46,7 @@ MIN_AGREEING = 3  # frames whose depth maps must agree with an added point, the 
 AGREEMENT_TOLERANCE = 0.05  # relative difference of depths up to which a frame agrees with a point
 SEEN_THROUGH_TOLERANCE = 0.1  # relative difference of depths from which a frame sees past a point to what is behind
 MAX_SEEN_THROUGH = 0.25  # frames that see past a point, over those that agree with it
+AROUND = 8  # points whose median a point is moved to
 
 
 class DepthMap(NamedTuple):
@@ -74,6 +77,13 @@ def find_surfaces(
     if not most:
         return np.zeros((0, 3), np.float32)
     return fused(points[:0] if random else points, depth_maps(points, split), most)
+
+
+def thinned(points: Float[np.ndarray, "P 3"], most: int) -> Float[np.ndarray, "N 3"]:
+    """At most so many points, as densely where they are dense, each at the median of those around it, without noise."""
+    kept = points[z_order(points)[evenly_spread(len(points), most)]]
+    _, around = cKDTree(points).query(kept, k=range(1, min(AROUND, len(points)) + 1))
+    return np.median(points[around], axis=1)
 
 
 def depth_maps(points: Float[np.ndarray, "P 3"], split: Split) -> list[DepthMap]:

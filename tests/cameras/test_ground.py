@@ -5,7 +5,7 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 from l2dgs_jax.cameras.geometry import project_points
-from l2dgs_jax.cameras.ground import find_ground, ground_depths, horizontal_per_depth
+from l2dgs_jax.cameras.ground import FLOW_TOLERANCE, find_ground, ground_depths, horizontal_per_depth
 
 LEVEL = np.eye(4)[None]  # of a camera whose upward direction is -y
 
@@ -34,6 +34,15 @@ def test_scale_and_place_do_not_matter():
     large, small = find_ground(1000 * points + 50, LEVEL), find_ground(points, LEVEL)
     assert_allclose(large.up, small.up, atol=1e-6)
     assert_allclose(large.height, 1000 * small.height + 50 * small.up.sum(), rtol=1e-6)
+
+
+def test_noisier_points_show_the_ground_with_more_tolerance():
+    rng = np.random.default_rng(0)
+    points = np.concatenate([floor(rng, noise=0.1), rng.uniform((-2, -1, 2), (2, 1, 6), (2000, 3))])
+    assert find_ground(points, LEVEL) is None
+    found = find_ground(points, LEVEL, FLOW_TOLERANCE)
+    assert_allclose(found.up, (0, -1, 0), atol=0.1)
+    assert_allclose(found.height, -1, atol=0.4)
 
 
 def test_there_is_no_ground_without_a_plane_or_across_the_cameras():

@@ -243,7 +243,7 @@ def test_a_training_starts_with_the_seeds_after_the_points(tracked):
 def test_the_largest_number_of_gaussians_limits_the_seeds(tracked, monkeypatch):
     asked = []
     module = sys.modules["l2dgs_jax.training.initial_state"]
-    monkeypatch.setattr(module, "find_seeds", lambda *given: asked.append(given[-1]) or TWO_SEEDS)
+    monkeypatch.setattr(module, "find_seeds", lambda *given: asked.append(given[3]) or TWO_SEEDS)
     for limit in (5, 10**6):
         initial_state(make_dataset(), overrides.replace(tracked[0], {"density.max_gaussians": limit}))
     assert asked[0] == 5 < asked[1] < 10**6  # the second by the number of pixels

@@ -16,7 +16,7 @@ from l2dgs_jax.config import overrides
 from l2dgs_jax.data import Dataset, Split
 from l2dgs_jax.training import initial_state, surfaces
 from l2dgs_jax.training.initial_state import SPARSE_POINTS
-from l2dgs_jax.training.surfaces import depth_maps, find_surfaces, fused, triangulated
+from l2dgs_jax.training.surfaces import depth_maps, find_surfaces, fused, thinned, triangulated
 from l2dgs_jax.types import Camera
 
 COUNT, MANY = 10, 40_000
@@ -176,6 +176,16 @@ def test_training_starts_from_the_added_points_too(monkeypatch, illumination):
     assert int(after.alive.sum()) == len(dataset.points) + len(added)
     means = np.asarray(after.params.gaussians.means[after.alive])
     assert all(np.isclose(means, point, atol=1e-6).all(-1).any() for point in added)
+
+
+def test_thinned_points_have_less_noise():
+    rng = np.random.default_rng(0)
+    noisy = np.column_stack([rng.uniform(-1, 1, (5000, 2)), rng.normal(0, 0.02, 5000)])
+    few = thinned(noisy, 1000)
+    assert few.shape == (1000, 3)
+    assert few[:, 2].std() < 0.6 * noisy[:, 2].std()
+    np.testing.assert_allclose(few.std(0)[:2], noisy.std(0)[:2], rtol=0.05)
+    assert thinned(noisy[:3], 1000).shape == (3, 3)
 
 
 @pytest.mark.parametrize("enough", [True, False])
