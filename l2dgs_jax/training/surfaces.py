@@ -80,7 +80,7 @@ def find_surfaces(
 
 
 def thinned(points: Float[np.ndarray, "P 3"], most: int) -> Float[np.ndarray, "N 3"]:
-    """At most so many points, as densely where they are dense, each at the median of those around it, without noise."""
+    """At most so many points, as densely where they are dense, each at the median of those around it."""
     kept = points[z_order(points)[evenly_spread(len(points), most)]]
     _, around = cKDTree(points).query(kept, k=range(1, min(AROUND, len(points)) + 1))
     return np.median(points[around], axis=1)
