@@ -98,13 +98,12 @@ def write(dataset: Dataset, folder: Path) -> None:
         "test_filenames": files["val"],
         "frames": sorted(frames.values(), key=lambda frame: frame["file_path"]),
     }
-    if not dataset.points_are_random:
-        content["ply_file_path"] = clouds.CLOUD_FILES[0]
     with new_folder(folder) as target:
         write_pictures(dataset, target / "images", target)
-        write_json(target / "transforms.json", content)
         if not dataset.points_are_random:
+            content["ply_file_path"] = clouds.CLOUD_FILES[0]
             clouds.write_ply(target / clouds.CLOUD_FILES[0], dataset.points, dataset.colors)
+        write_json(target / "transforms.json", content)
 
 
 def world_to_camera(source: str, key: str, matrix: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "4 4"]:

@@ -13,6 +13,7 @@ from scipy.special import logit
 
 from l2dgs_jax.cameras.geometry import camera_extent, median_depth
 from l2dgs_jax.config import ModelConfig
+from l2dgs_jax.data.stacks import evenly_spread
 from l2dgs_jax.model import hexplane, networks
 from l2dgs_jax.model.deformation import has_path, length_unit
 from l2dgs_jax.model.tone_curves import RAMPS
@@ -62,6 +63,11 @@ def z_order(points: np.ndarray) -> np.ndarray:
     cells = ((points - low) / span * (2**bits - 1)).astype(np.int64)
     interleaved = (((cells[:, axis] >> bit) & 1) << (3 * bit + axis) for bit in range(bits) for axis in range(3))
     return np.argsort(sum(interleaved), kind="stable")
+
+
+def spread_over(points: np.ndarray, most: int) -> np.ndarray:
+    """Indices of at most so many of the points [P 3], as densely where they are dense."""
+    return z_order(points)[evenly_spread(len(points), most)]
 
 
 def initialise(

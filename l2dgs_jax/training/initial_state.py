@@ -11,10 +11,9 @@ from l2dgs_jax.cameras.geometry import median_depth
 from l2dgs_jax.cameras.ground import FLOW_TOLERANCE, TOLERANCE
 from l2dgs_jax.config import Config, ModelConfig, overrides
 from l2dgs_jax.data.dataset import Dataset, Split
-from l2dgs_jax.data.stacks import evenly_spread
 from l2dgs_jax.errors import UserError
 from l2dgs_jax.model import networks
-from l2dgs_jax.model.initialisation import initialise, path_knots, scene_shapes, z_order
+from l2dgs_jax.model.initialisation import initialise, path_knots, scene_shapes, spread_over, z_order
 from l2dgs_jax.model.observation import evenly_exposed, exposures, observed_colors
 from l2dgs_jax.model.tone import Darkening, darkening, lit_level, recognise
 from l2dgs_jax.model.tone_curves import equalising_law, power_law
@@ -122,7 +121,7 @@ def initial_state(dataset: Dataset, config: Config) -> TrainState:
     colors = dataset.colors if config.model.initial_illumination is None else None  # what they are needed for
     sparse, points, tolerance = dataset.points, dataset.points, TOLERANCE
     if len(points) > most:
-        kept = z_order(points)[evenly_spread(len(points), most)]
+        kept = spread_over(points, most)
         points, colors = points[kept], None if colors is None else colors[kept]
     gains, even = None, train
     if config.model.exposure == "drifting":

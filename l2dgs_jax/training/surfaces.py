@@ -24,7 +24,7 @@ from l2dgs_jax.cameras.flow import brightened, matcher, pixel_indices, surely_va
 from l2dgs_jax.cameras.geometry import camera_centres, pixel_rays, points_inside
 from l2dgs_jax.data.dataset import Split
 from l2dgs_jax.data.stacks import evenly_spread
-from l2dgs_jax.model.initialisation import z_order
+from l2dgs_jax.model.initialisation import spread_over
 from l2dgs_jax.runtime.prefetch import prefetch
 from l2dgs_jax.types import Camera
 
@@ -81,7 +81,7 @@ def find_surfaces(
 
 def thinned(points: Float[np.ndarray, "P 3"], most: int) -> Float[np.ndarray, "N 3"]:
     """At most so many points, as densely where they are dense, each at the median of those around it."""
-    kept = points[z_order(points)[evenly_spread(len(points), most)]]
+    kept = points[spread_over(points, most)]
     _, around = cKDTree(points).query(kept, k=range(1, min(AROUND, len(points)) + 1))
     return np.median(points[around], axis=1)
 
